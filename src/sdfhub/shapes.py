@@ -1,0 +1,119 @@
+"""What crosses the seams: a mesh, the samples of a shape, a batch. Each is checked once, here.
+
+Frame: a shape's bounding-box centre lies at 0 and its farthest vertex at 1 / 1.03, so all of it lies
+in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+RADIUS = 1 / 1.03
+"""Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
+
+
+def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
+    fits = len(array.shape) == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype != dtype:
+        wanted = f"{list(shape)} {dtype}"
+        raise ValueError(f"{name}: expected {wanted}, got {list(array.shape)} {array.dtype}")
+
+
+@dataclass(frozen=True)
+class NormalizedMesh:
+    """A triangle mesh in the normalised frame and the way back to its source's frame.
+
+    Args:
+        vertices: [V, 3] float64, all within the unit ball.
+        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside.
+        center: [3] float64, source units.
+        scale: normalised units per source unit, > 0.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    center: np.ndarray
+    scale: float
+
+    def __post_init__(self):
+        _check("vertices", self.vertices, (None, 3), np.float64)
+        _check("faces", self.faces, (None, 3), np.int64)
+        _check("center", self.center, (3,), np.float64)
+        if not np.isfinite(self.vertices).all() or np.abs(self.vertices).max(initial=0) > 1 + 1e-6:
+            raise ValueError("vertices: must be finite and inside the unit ball")
+        if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
+            raise ValueError("faces: index a vertex that is not there")
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale: must be a positive number, got {self.scale}")
+
+
+@dataclass(frozen=True)
+class ShapeSamples:
+    """Signed distances and oriented surface points of one shape, normalised frame.
+
+    Args:
+        points: [N, 3] float32, within [-1.2, 1.2]^3 (jitter may leave the cube a little).
+        sdf: [N] float32, negative inside.
+        surface_points: [M, 3] float32; M = 0 where the source carries none.
+        surface_normals: [M, 3] float32, unit length, outward.
+        center: [3] float64, source units.
+        scale: normalised units per source unit; `source = normalised / scale + center`.
+        mesh: the oriented faces from which the samples were taken, or None (DeepSDF's npz carry none).
+        statistics: plain numbers about the preparation (two-sided area, inside fraction, ...).
+    """
+
+    points: np.ndarray
+    sdf: np.ndarray
+    surface_points: np.ndarray
+    surface_normals: np.ndarray
+    center: np.ndarray
+    scale: float
+    mesh: NormalizedMesh | None
+    statistics: dict[str, float]
+
+    def __post_init__(self):
+        n, m = len(self.points), len(self.surface_points)
+        _check("points", self.points, (n, 3), np.float32)
+        _check("sdf", self.sdf, (n,), np.float32)
+        _check("surface_points", self.surface_points, (m, 3), np.float32)
+        _check("surface_normals", self.surface_normals, (m, 3), np.float32)
+        for name in ("points", "sdf", "surface_points", "surface_normals"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name}: must be finite")
+        if m and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3:
+            raise ValueError("surface_normals: must have unit length")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples of B shapes for one training step, normalised frame; the shape axis is kept.
+
+    Args:
+        rows: [B] int64, row of each shape in the code table.
+        points: [B, N, 3] float32.
+        sdf: [B, N] float32, negative inside.
+        surface_points: [B, M, 3] float32; M = 0 without normals.
+        surface_normals: [B, M, 3] float32, unit length, outward.
+    """
+
+    rows: torch.Tensor
+    points: torch.Tensor
+    sdf: torch.Tensor
+    surface_points: torch.Tensor
+    surface_normals: torch.Tensor
+
+    def __post_init__(self):
+        b, n = self.points.shape[:2]
+        m = self.surface_points.shape[1]
+        _check("rows", self.rows, (b,), torch.int64)
+        _check("points", self.points, (b, n, 3), torch.float32)
+        _check("sdf", self.sdf, (b, n), torch.float32)
+        _check("surface_points", self.surface_points, (b, m, 3), torch.float32)
+        _check("surface_normals", self.surface_normals, (b, m, 3), torch.float32)
+
+    def to(self, device, non_blocking: bool = False) -> "Batch":
+        """The same batch on another device."""
+        return Batch(*(getattr(self, f).to(device, non_blocking=non_blocking) for f in self.__match_args__))
