@@ -1,0 +1,214 @@
+"""Streams per-shape samples as training batches: step number in, batch out, nothing remembered.
+
+A batch is a function of (seed, step), so that a resumed run sees what an uninterrupted one would, with any
+number of loader workers. Shards are pre-shuffled, so a random draw is one contiguous, wrapping slice.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import lightning as L
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from sdfhub.data.store import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Batch
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Extra training shapes: seeded similar copies of the real ones, each with a code of its own.
+
+    The paper names data augmentation and does not describe it. Reflection and uniform scaling are the
+    transforms under which a signed distance stays exact (d becomes scale * d), so these it is; the code
+    table grows by a factor 1 + copies.
+
+    Args:
+        copies: transformed copies of each shape, >= 0; 0 switches augmentation off.
+        mirror: whether odd copies are reflected in the plane x = 0.
+        smallest: lower end of the uniform distribution, up to 1, of a copy's scale, in (0, 1].
+    """
+
+    copies: int = 0
+    mirror: bool = True
+    smallest: float = 0.8
+
+    def __post_init__(self):
+        if self.copies < 0 or not 0 < self.smallest <= 1:
+            raise ValueError("augmentation: copies must not be negative and smallest in (0, 1]")
+
+    def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
+        """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
+        if copy == 0:
+            return np.ones(3, np.float32), np.float32(1)
+        scale = np.float32(np.random.default_rng((seed, row)).uniform(self.smallest, 1))
+        flip = -1 if self.mirror and copy % 2 else 1
+        return np.float32([flip, 1, 1]) * scale, scale
+
+
+class StepBatches(Dataset):
+    """Training batches by step number.
+
+    Args:
+        shapes: S prepared shapes; shape s has code row s, its copy c row s + c * S.
+        shapes_per_step: B; never more than there are rows.
+        samples_per_shape: N, half of them outside, half inside.
+        surface_per_shape: M oriented surface points; 0 without normals.
+        augmentation: extra shapes.
+        seed: of every draw.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[StoredShape],
+        shapes_per_step: int,
+        samples_per_shape: int,
+        surface_per_shape: int,
+        augmentation: Augmentation,
+        seed: int,
+    ):
+        self.shapes, self.seed, self.augmentation = shapes, seed, augmentation
+        self.rows = len(shapes) * (1 + augmentation.copies)
+        self.shapes_per_step = min(shapes_per_step, self.rows)
+        self.samples_per_shape, self.surface_per_shape = samples_per_shape, surface_per_shape
+        self.steps_per_pass = self.rows // self.shapes_per_step
+        self.rank, self.world = 0, 1
+
+    def share(self, rank: int, world: int) -> None:
+        """Keeps, of every batch, the part of process `rank` of `world`."""
+        if self.shapes_per_step % world:
+            raise SdfhubError(
+                f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared evenly by {world} processes; "
+                f"choose a multiple of {world}"
+            )
+        self.rank, self.world = rank, world
+
+    def __len__(self) -> int:
+        return self.steps_per_pass
+
+    def __getitem__(self, step: int) -> Batch:
+        # every pass shuffles anew; rows beyond the last whole step wait for another pass's order
+        order = np.random.default_rng((self.seed, 1, step // self.steps_per_pass)).permutation(self.rows)
+        start = step % self.steps_per_pass * self.shapes_per_step
+        rows = order[start : start + self.shapes_per_step][self.rank :: self.world]
+        drawn = [self._draw(int(row), np.random.default_rng((self.seed, 2, step, row))) for row in rows]
+        samples, surface = (torch.from_numpy(np.stack(part)) for part in zip(*drawn, strict=True))
+        return Batch(
+            rows=torch.from_numpy(rows),
+            points=samples[..., :3],
+            sdf=samples[..., 3],
+            surface_points=surface[..., :3],
+            surface_normals=surface[..., 3:],
+        )
+
+    def _draw(self, row: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
+        copy, index = divmod(row, len(self.shapes))
+        shape = self.shapes[index]
+        axes, scale = self.augmentation.transform(copy, row, self.seed)
+        inside = self.samples_per_shape // 2
+        samples = np.concatenate(
+            [
+                wrapping_slice(shape.outside, self.samples_per_shape - inside, rng),
+                wrapping_slice(shape.inside, inside, rng),
+            ]
+        )
+        surface = wrapping_slice(shape.surface, self.surface_per_shape, rng)
+        if copy:
+            samples *= np.append(axes, scale)
+            surface *= np.concatenate([axes, np.sign(axes)])
+        return samples, surface
+
+
+def wrapping_slice(array: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """`count` consecutive rows from a random start, going on at the first row after the last.
+
+    Args:
+        array: [R, C], pre-shuffled, R >= 1 unless count is 0.
+        count: rows wanted; may exceed R.
+        rng: draws the start.
+    """
+    if count == 0:
+        return np.empty((0, array.shape[1]), array.dtype)
+    start = int(rng.integers(len(array)))
+    if start + count <= len(array):
+        return np.array(array[start : start + count])
+    return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
+
+
+class EpochSteps(Sampler[int]):
+    """The step numbers of one epoch. Lightning tells the epoch through `set_epoch`, also after a resume."""
+
+    def __init__(self, steps: int):
+        self.steps, self.epoch = steps, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(self.epoch * self.steps, (self.epoch + 1) * self.steps))
+
+
+class SdfDataModule(L.LightningDataModule):
+    """Prepared shapes as a training stream.
+
+    Args:
+        shapes: prepared training shapes, in the order of the code table.
+        shapes_per_step: B.
+        samples_per_shape: N, half outside, half inside.
+        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
+        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
+            from being shorter than their overhead.
+        workers: loader processes; 0 draws in the training process.
+        augmentation: extra shapes.
+        seed: of every draw.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[StoredShape],
+        shapes_per_step: int,
+        samples_per_shape: int,
+        surface_per_shape: int,
+        passes_per_epoch: int,
+        workers: int,
+        augmentation: Augmentation,
+        seed: int,
+    ):
+        super().__init__()
+        if min(shapes_per_step, passes_per_epoch) < 1 or samples_per_shape < 2:
+            raise ValueError(
+                "data: shapes_per_step and passes_per_epoch must be at least 1, samples_per_shape 2"
+            )
+        if not shapes:
+            raise SdfhubError("data: no shape is left to train on; look at the rejections above")
+        if surface_per_shape and not all(len(shape.surface) for shape in shapes):
+            raise SdfhubError(
+                "normals=on: this data source carries no surface normals "
+                "(DeepSDF's npz files have none); train with normals=off"
+            )
+        self.batches = StepBatches(
+            shapes, shapes_per_step, samples_per_shape, surface_per_shape, augmentation, seed
+        )
+        self.passes_per_epoch, self.workers = passes_per_epoch, workers
+
+    @property
+    def rows(self) -> int:
+        """Rows that the code table needs: shapes and their augmented copies."""
+        return self.batches.rows
+
+    def train_dataloader(self) -> DataLoader:
+        if self.trainer is not None:
+            self.batches.share(self.trainer.global_rank, self.trainer.world_size)
+        return DataLoader(
+            self.batches,
+            sampler=EpochSteps(self.batches.steps_per_pass * self.passes_per_epoch),
+            batch_size=None,
+            num_workers=self.workers,
+            persistent_workers=False,  # a worker of the last epoch would not hear of the next
+        )

@@ -1,0 +1,112 @@
+"""Raw triangle arrays, validated, moved to the normalised frame and cleaned there."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sdfhub.data.preparation import Preparation
+from sdfhub.errors import RejectedMesh
+from sdfhub.shapes import RADIUS, NormalizedMesh
+
+ZERO_AREA = 1e-13
+"""Area below which a triangle counts as none, normalised units squared (a sliver of 1e-6 by 2e-7)."""
+
+
+def normalize_mesh(
+    vertices: np.ndarray, faces: np.ndarray, preparation: Preparation = Preparation()
+) -> NormalizedMesh:
+    """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
+
+    The frame comes before the merging: a tolerance means something only once the size is known, and a mesh
+    of scale 1e20 or 1e-12 must survive it. Triangles with the same three corners count once, whichever way they turn.
+
+    Args:
+        vertices: [V, 3] numbers, source units.
+        faces: [F, 3] integers, rows of `vertices`.
+        preparation: `min_faces`, `min_extent_ratio`, `max_zero_area` and `max_components` are used.
+    Raises:
+        RejectedMesh: the arrays make no mesh, or a limit is passed.
+    """
+    vertices, faces = _checked_arrays(vertices, faces)
+    if len(faces) < preparation.min_faces:
+        raise RejectedMesh("too_few_faces", f"{len(faces)} faces, at least {preparation.min_faces} wanted")
+    vertices, center, scale = _normalized(vertices, faces, preparation.min_extent_ratio)
+    vertices, faces = _merged(vertices, faces)
+    faces = _with_area(vertices, faces, preparation.max_zero_area)
+    faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+    count = len(np.unique(face_components(faces, len(vertices))))
+    if count > preparation.max_components:
+        raise RejectedMesh("too_many_components", f"{count} pieces, at most {preparation.max_components} wanted")
+    return NormalizedMesh(vertices, faces, center, scale)
+
+
+def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        vertices, faces = np.asarray(vertices), np.asarray(faces)
+    except ValueError as error:  # rows of different lengths
+        raise RejectedMesh("malformed_arrays", str(error)) from error
+    if faces.size == 0 or vertices.size == 0:
+        raise RejectedMesh("no_faces", f"{len(vertices)} vertices and {len(faces)} faces")
+    for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            raise RejectedMesh(
+                "malformed_arrays", f"{name}: expected [N, 3] numbers, got {list(array.shape)} {array.dtype}"
+            )
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RejectedMesh(
+            "face_index_out_of_range", f"{faces.min()} to {faces.max()}, with {len(vertices)} vertices"
+        )
+    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+    if bad:
+        raise RejectedMesh("non_finite_vertices", f"{bad} of {len(vertices)} vertices are not finite")
+    return vertices, faces
+
+
+def _normalized(
+    vertices: np.ndarray, faces: np.ndarray, min_extent_ratio: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    used, faces_flat = np.unique(faces, return_inverse=True)
+    corners = vertices[used]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    half = high / 2 - low / 2  # halves first: the sum of two large numbers may overflow
+    if not half.max() > 0 or half.min() / half.max() < min_extent_ratio:
+        ratio = half.min() / half.max() if half.max() > 0 else 0.0
+        raise RejectedMesh("flat", f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted")
+    center = high / 2 + low / 2
+    unit = (vertices - center) / half.max()  # near 1 before squares are taken
+    farthest = np.linalg.norm(unit[used], axis=1).max()
+    scale = RADIUS / farthest / half.max()
+    if not (np.isfinite(scale) and scale > 0):
+        raise RejectedMesh("extent_out_of_range", f"largest extent {2 * half.max():.2g} cannot be normalised")
+    return unit * (RADIUS / farthest), center, float(scale)
+
+
+def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that share a cell of width 1e-6 become the first of them; unused ones go."""
+    used, faces = np.unique(faces, return_inverse=True)
+    cells = np.floor((vertices[used] + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
+    keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
+    _, first, row = np.unique(keys, return_index=True, return_inverse=True)
+    return vertices[used][first], row[faces.reshape(-1, 3)].astype(np.int64)
+
+
+def _with_area(vertices: np.ndarray, faces: np.ndarray, max_zero_area: float) -> np.ndarray:
+    filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
+    empty = 1 - filled.mean()
+    if empty > max_zero_area:
+        raise RejectedMesh("zero_area_faces", f"{empty:.1%} of the faces, at most {max_zero_area:.0%} wanted")
+    return faces[filled]
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F, 3] normals, each as long as twice its triangle's area; counter-clockwise is outside."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def face_components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """[F] label of each face's connected piece: faces that share a vertex share a label."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
+    return connected_components(graph, directed=False)[1][faces[:, 0]]

@@ -1,0 +1,51 @@
+"""The five categories by name, and the mesh of any of their shapes."""
+
+import numpy as np
+
+from sdfhub.data.procedural import chairs
+from sdfhub.data.procedural.parameters import draw
+from sdfhub.errors import SdfhubError
+
+VERSION = 1
+"""Raised whenever a generator changes what it makes; stores hash it."""
+
+_DESIGNS = {"chairs": (1, chairs.Chair)}  # the code seeds the draw: never reuse or change one
+
+CATEGORIES = tuple(_DESIGNS)
+
+
+def design(category: str, index: int):
+    """The parameters of shape `index` of a category, as its frozen dataclass; `.build()` makes the solid.
+
+    Args:
+        category: one of CATEGORIES.
+        index: >= 0; the same index always gives the same design.
+
+    Raises:
+        SdfhubError: for an unknown category or a negative index.
+    """
+    if category not in _DESIGNS:
+        raise SdfhubError(f"category={category}: no such procedural category; choose {', '.join(CATEGORIES)}")
+    if index < 0:
+        raise SdfhubError(f"index={index}: procedural shapes are counted from 0")
+    code, kind = _DESIGNS[category]
+    return draw(kind, np.random.default_rng([code, index]))
+
+
+def generate(category: str, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh of shape `index` of a category: closed, oriented outwards, one shell.
+
+    Args:
+        category: one of CATEGORIES.
+        index: >= 0; the same index always gives the same shape.
+
+    Returns:
+        vertices: [V, 3] float64, metres, +z up, front towards -y.
+        faces: [F, 3] int64, counter-clockwise seen from outside.
+
+    Raises:
+        SdfhubError: for an unknown category or a negative index.
+    """
+    mesh = design(category, index).build().to_mesh64()
+    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
+    return vertices, np.array(mesh.tri_verts, dtype=np.int64)

@@ -1,0 +1,31 @@
+"""How a design's parameters are declared and drawn.
+
+A category is a frozen dataclass: every field is either a `continuous` number within a range or a `choice`
+among a few. The declaration is all that a draw, a test or a reader needs.
+"""
+
+from dataclasses import field, fields
+
+import numpy as np
+
+
+def continuous(low: float, high: float):
+    """A float field drawn uniformly from [low, high)."""
+    return field(metadata={"range": (low, high)})
+
+
+def choice(*options):
+    """A field drawn from `options`, each as likely as the others; repeat one to favour it."""
+    return field(metadata={"options": options})
+
+
+def draw(design: type, rng: np.random.Generator):
+    """One design with every field drawn in the order of declaration."""
+    values = {}
+    for f in fields(design):
+        if "range" in f.metadata:
+            values[f.name] = float(rng.uniform(*f.metadata["range"]))
+        else:
+            options = f.metadata["options"]
+            values[f.name] = options[int(rng.integers(len(options)))]
+    return design(**values)

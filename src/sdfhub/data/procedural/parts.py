@@ -1,0 +1,235 @@
+"""Solids that furniture and aircraft are made of, each a closed manifold.
+
+Lengths are metres, +z is up. Every part is built so that its neighbours overlap it: a union of overlapping
+solids is one shell, a union of solids that merely touch is not.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from manifold3d import CrossSection, Manifold, Mesh64, OpType
+
+SEGMENTS = 24
+"""Sides of a round part unless it says otherwise."""
+
+
+def union(parts: Sequence[Manifold]) -> Manifold:
+    """The solid covered by any of the parts (exact boolean)."""
+    return Manifold.batch_boolean(list(parts), OpType.Add)
+
+
+def box(size: Sequence[float], centre: Sequence[float]) -> Manifold:
+    """An axis-aligned box with sharp edges."""
+    return Manifold.cube(tuple(map(float, size)), True).translate(tuple(map(float, centre)))
+
+
+def rounded_box(size: Sequence[float], centre: Sequence[float], radius: float, steps: int = 3) -> Manifold:
+    """A box whose edges and corners are rounded with one radius: a cushion, a padded arm.
+
+    Args:
+        size: [3] full extents.
+        centre: [3].
+        radius: of the rounding; cut to half the thinnest extent.
+        steps: facets per quarter of a circle.
+    """
+    half = np.asarray(size, float) / 2
+    r = min(radius, 0.98 * half.min())
+    theta = np.linspace(0, np.pi / 2, steps + 1)
+    octant = np.array([(np.cos(p) * np.cos(t), np.cos(p) * np.sin(t), np.sin(p)) for p in theta for t in theta])
+    signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], float)
+    points = (signs[:, None] * (half - r + r * octant)).reshape(-1, 3)
+    return Manifold.hull_points(np.ascontiguousarray(points + np.asarray(centre, float)))
+
+
+def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: int = 3) -> Manifold:
+    """A convex outline extruded from bottom to top with rounded rims: a seat, a table top, a cushion.
+
+    Args:
+        outline: [N, 2] convex polygon.
+        bottom, top: heights.
+        radius: of the rims, < half the outline's width; 0 keeps them sharp.
+        steps: facets per quarter of a circle.
+    """
+    r = min(radius, 0.49 * (top - bottom))
+    if r <= 0:
+        return prism(outline, bottom, top)
+    centre = outline.mean(0)
+    reach = np.linalg.norm(outline - centre, axis=1, keepdims=True)
+    layers = []
+    for angle in np.linspace(0, np.pi / 2, steps + 1):
+        inset = centre + (outline - centre) * (1 - r * (1 - np.cos(angle)) / reach)
+        for z in (top - r + r * np.sin(angle), bottom + r - r * np.sin(angle)):
+            layers.append(np.column_stack([inset, np.full(len(inset), z)]))
+    return Manifold.hull_points(np.vstack(layers))
+
+
+def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
+    """A polygon (convex or not, counter-clockwise) extruded from bottom to top."""
+    section = CrossSection([np.asarray(outline, float)])
+    return Manifold.extrude(section, top - bottom).translate((0.0, 0.0, float(bottom)))
+
+
+def loft(sections: np.ndarray) -> Manifold:
+    """The solid through a sequence of closed sections, with flat ends.
+
+    Args:
+        sections: [K, N, 3] points of K star-shaped sections of N points each, all with one sense of rotation.
+    """
+    k, n = sections.shape[:2]
+    vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
+    i, j = np.meshgrid(np.arange(k - 1), np.arange(n), indexing="ij")
+    a, b = (i * n + j).ravel(), (i * n + (j + 1) % n).ravel()
+    ring, following = np.arange(n), (np.arange(n) + 1) % n
+    last = (k - 1) * n
+    faces = np.vstack(
+        [
+            np.column_stack([a, b, b + n]),
+            np.column_stack([a, b + n, a + n]),
+            np.column_stack([following, ring, np.full(n, k * n)]),
+            np.column_stack([last + ring, last + following, np.full(n, k * n + 1)]),
+        ]
+    )
+    corners = vertices[faces] - vertices.mean(0)
+    if np.linalg.det(corners).sum() < 0:
+        faces = faces[:, ::-1]
+    mesh = Mesh64(np.ascontiguousarray(vertices), np.ascontiguousarray(faces.astype(np.uint64)))
+    return Manifold(mesh)
+
+
+def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)) -> Manifold:
+    """A section carried along a path: a curved rail, a bent tube, a slat.
+
+    Args:
+        path: [K, 3]; its bends must be wider than the section.
+        section: [N, 2] or [K, N, 2] star-shaped polygon: first axis sideways (tangent x up), second along `up`.
+        up: direction the section's second axis follows; not parallel to the path.
+    """
+    path = np.asarray(path, float)
+    leaving = _unit(np.diff(path, axis=0))
+    tangent = _unit(np.vstack([leaving[:1], leaving[:-1] + leaving[1:], leaving[-1:]]))
+    side = _unit(np.cross(tangent, np.asarray(up, float)))
+    over = np.cross(side, tangent)
+    section = np.broadcast_to(section, (len(path), *np.shape(section)[-2:]))
+    return loft(path[:, None] + section[..., :1] * side[:, None] + section[..., 1:] * over[:, None])
+
+
+def tube(path: np.ndarray, radius: float | np.ndarray, segments: int = 12, up: Sequence[float] = (0, 0, 1)) -> Manifold:
+    """A round bar along a path; `radius` is one number or one per point of the path."""
+    radii = np.broadcast_to(radius, len(path))
+    return sweep(path, radii[:, None, None] * circle(segments), up)
+
+
+def bar(start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None) -> Manifold:
+    """A straight round bar, tapered from radius to end_radius."""
+    end_radius = radius if end_radius is None else end_radius
+    return _along(lathe([(radius, 0.0), (end_radius, 1.0)], 14, stretch=False), start, end)
+
+
+def square_bar(start: Sequence[float], end: Sequence[float], width: float, end_width: float | None = None) -> Manifold:
+    """A straight bar of square section with its sides along x and y, cut level at both ends."""
+    end_width = width if end_width is None else end_width
+    square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+    rings = [np.column_stack([w * square, np.zeros(4)]) + p for p, w in ((start, width), (end, end_width))]
+    return loft(np.array(rings))
+
+
+def plank(start: Sequence[float], end: Sequence[float], thickness: float, height: float) -> Manifold:
+    """A straight board on edge from start to end, its height along z."""
+    half = np.array([thickness, height]) / 2
+    section = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
+    return sweep(np.array([start, end], float), section)
+
+
+def turned(start: Sequence[float], end: Sequence[float], profile: Sequence[tuple[float, float]]) -> Manifold:
+    """A lathe-turned bar: `profile` holds (radius, height), height from 0 at start to 1 at end."""
+    return _along(lathe(profile, 18, stretch=False), start, end)
+
+
+def lathe(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS, stretch: bool = True) -> Manifold:
+    """A solid of revolution around z.
+
+    Args:
+        profile: (radius, height) from bottom to top, radii > 0; the axis closes it.
+        segments: sides of the circle.
+        stretch: let the polygon's area equal the circle's, so that few sides do not shrink it.
+    """
+    profile = np.asarray(profile, float)
+    ring = circle(segments) * (np.sqrt(2 * np.pi / segments / np.sin(2 * np.pi / segments)) if stretch else 1.0)
+    rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in profile]
+    return loft(np.array(rings))
+
+
+def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:
+    """An open shell of revolution around z: a lampshade, a bowl.
+
+    Args:
+        profile: [N, 2] (radius, height) of its middle surface, radii > thickness / 2.
+        thickness: of the wall.
+        segments: sides of the circle.
+    """
+    profile = np.asarray(profile, float)
+    tangent = _unit(np.gradient(profile, axis=0))
+    normal = np.column_stack([tangent[:, 1], -tangent[:, 0]])
+    ring = np.vstack([profile + normal * thickness / 2, (profile - normal * thickness / 2)[::-1]])
+    return Manifold.revolve(CrossSection([ring]), segments)
+
+
+def ellipsoid(radii: Sequence[float], centre: Sequence[float], segments: int = 24) -> Manifold:
+    """An ellipsoid with its axes along x, y and z."""
+    return Manifold.sphere(1.0, segments).scale(tuple(map(float, radii))).translate(tuple(map(float, centre)))
+
+
+def circle(segments: int) -> np.ndarray:
+    """[segments, 2] points on the unit circle, counter-clockwise."""
+    angle = 2 * np.pi * np.arange(segments) / segments
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def rounded_rectangle(width: float, depth: float, radius: float, back_width: float | None = None) -> np.ndarray:
+    """[N, 2] rectangle around 0 with rounded corners; `back_width` is its width at +y where it tapers."""
+    back_width = width if back_width is None else back_width
+    corners = [(-width, -depth, 180), (width, -depth, 270), (back_width, depth, 0), (-back_width, depth, 90)]
+    points = []
+    for x, y, first in corners:
+        angle = np.radians(np.linspace(first, first + 90, 6))
+        middle = np.array([x / 2 - np.sign(x) * radius, y / 2 - np.sign(y) * radius])
+        points.append(middle + radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+    return np.vstack(points)
+
+
+def arc(start: Sequence[float], end: Sequence[float], bulge: Sequence[float], count: int = 9) -> np.ndarray:
+    """[count, 3] parabola from start to end whose middle is moved by `bulge`."""
+    t = np.linspace(0, 1, count)[:, None]
+    start, end, bulge = (np.asarray(v, float) for v in (start, end, bulge))
+    return (1 - t) * start + t * end + 4 * t * (1 - t) * bulge
+
+
+def filleted(corners: Sequence[Sequence[float]], radius: float, steps: int = 4) -> np.ndarray:
+    """[K, 3] polyline through `corners` with its bends rounded by about `radius`."""
+    corners = np.asarray(corners, float)
+    path = [corners[0]]
+    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
+        start = corner + radius * _unit(before - corner)
+        end = corner + radius * _unit(after - corner)
+        t = np.linspace(0, 1, steps + 1)[:, None]
+        path.extend((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
+    return np.array([*path, corners[-1]])
+
+
+def mirrored(part: Manifold) -> list[Manifold]:
+    """The part and its mirror image across x = 0."""
+    return [part, part.mirror((1.0, 0.0, 0.0))]
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _along(unit: Manifold, start: Sequence[float], end: Sequence[float]) -> Manifold:
+    """A part of height 1 along z, moved and turned to run from start to end; its radii stay."""
+    start = np.asarray(start, float)
+    axis = np.asarray(end, float) - start
+    direction = _unit(axis)
+    helper = np.array([1.0, 0, 0]) if abs(direction[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = _unit(np.cross(helper, direction))
+    return unit.transform(np.column_stack([x, np.cross(direction, x), axis, start]))

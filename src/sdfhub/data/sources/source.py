@@ -1,0 +1,92 @@
+"""What every data source offers: a list of shapes, and the mesh or the samples of one of them."""
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import ShapeSamples
+
+Triangles = tuple[np.ndarray, np.ndarray]
+"""vertices [V, 3] float64 and faces [F, 3] int64 in the source's own frame."""
+
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}\Z")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One shape of a source, before anything of it is loaded.
+
+    Args:
+        id: unique within the source and safe as a folder's path, such as `chairs/0007`.
+        category: such as `chairs`; splits draw evenly over categories.
+        fingerprint: changes when the shape changes (hash of the file, or generator version and index).
+        split: the role that a split file gives, or None.
+        credits: author, licence, title, as far as known.
+    """
+
+    id: str
+    category: str
+    fingerprint: str
+    split: Literal["train", "test"] | None = None
+    credits: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if not all(_PART.match(part) for part in self.id.split("/")):
+            raise ValueError(f"shape id {self.id!r}: parts must be letters, digits or _ . + -")
+
+
+class Source(ABC):
+    """Where shapes come from. Sources pickle: worker processes load through them.
+
+    Attributes:
+        name: folder-safe; the store keeps one folder per name, so it tells two roots apart.
+    """
+
+    name: str
+
+    @abstractmethod
+    def shapes(self) -> list[Shape]:
+        """All shapes on offer, sorted by id, the same in every process.
+
+        Raises:
+            SdfhubError: the source's root is not there or holds no shape.
+        """
+
+    @abstractmethod
+    def load(self, shape: Shape) -> Triangles | ShapeSamples:
+        """The mesh of one shape in its source's frame, or its samples where the source holds no mesh.
+
+        Raises:
+            RejectedMesh: the file holds no usable mesh.
+        """
+
+
+def plain_categories(categories: Mapping) -> dict[str, dict]:
+    """`categories` as plain dicts, so that a source pickles whatever mapping it was given.
+
+    Raises:
+        SdfhubError: a category is not a mapping.
+    """
+    if not isinstance(categories, Mapping) or not categories:
+        raise SdfhubError(f"category: expected at least one category with its settings, got {categories!r}")
+    wrong = [name for name, settings in categories.items() if not isinstance(settings, Mapping)]
+    if wrong:
+        raise SdfhubError(f"category.{wrong[0]}: expected a mapping (synset, catalogue, aircraft)")
+    return {str(name): _plain(settings) for name, settings in categories.items()}
+
+
+def _plain(value):
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value
+
+
+def folder_safe(text: str) -> str:
+    """`text` with everything that a shape's id may not hold replaced by `_`."""
+    safe = re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).lstrip("._+-")
+    return safe[:100] or "unnamed"

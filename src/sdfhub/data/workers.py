@@ -1,0 +1,96 @@
+"""A function mapped over worker processes; a worker that dies costs one item, not the rest."""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import connection
+from types import ModuleType
+from unittest.mock import patch
+
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
+"""What tells the numeric libraries how many threads to start; read when they are imported."""
+
+
+class Crashed:
+    """The result of an item whose worker process died (out of memory, a fault in a native library)."""
+
+
+def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[tuple[int, object]]:
+    """(index, function(item)) of each item, in the order in which they end.
+
+    Args:
+        function: picklable; its exceptions are raised here.
+        items: picklable.
+        workers: processes, each with one thread. They are not forked from the caller, whose threads (a
+            trainer's, a notebook's) would make that unsafe.
+
+    Yields:
+        Index and result; `Crashed` in place of the result where the worker died on that item.
+    """
+    left = dict(enumerate(items))
+    while left:
+        try:
+            for index, result in _map_until_crash(function, left, workers):
+                del left[index]
+                yield index, result
+        except BrokenProcessPool:
+            # Whichever item killed its worker was among the first of those left: try these one at a time.
+            for index in list(left)[: 2 * workers]:
+                yield index, _alone(function, left.pop(index))
+
+
+def _map_until_crash(function: Callable, items: dict, workers: int) -> Iterator[tuple[int, object]]:
+    with _pool(workers, function) as pool:
+        try:
+            with _startable(function):
+                futures = {pool.submit(function, item): index for index, item in items.items()}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _alone(function: Callable, item: object) -> object:
+    with _pool(1, function) as pool:
+        try:
+            with _startable(function):
+                future = pool.submit(function, item)
+            return future.result()
+        except BrokenProcessPool:
+            return Crashed()
+
+
+def _pool(workers: int, function: Callable) -> ProcessPoolExecutor:
+    methods = multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+    if context.get_start_method() == "forkserver":  # imports once what each worker would import
+        context.set_forkserver_preload([type(function).__module__])
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_follow_parent)
+
+
+def _follow_parent() -> None:
+    """Ends this worker when its parent is killed: the queue alone would keep it waiting for ever."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (connection.wait([parent.sentinel]), os._exit(1)), daemon=True).start()
+
+
+@contextmanager
+def _startable(function: Callable) -> Iterator[None]:
+    """Lets workers start single-threaded and, unless the function needs it, without the main script.
+
+    Python runs the main script again in every worker: seconds of imports for a trainer, and no start at
+    all for a script without an `if __name__ == "__main__"`.
+    """
+    needs_main = b"__main__" in pickle.dumps(function)
+    main = sys.modules["__main__"] if needs_main else ModuleType("__main__")
+    environment = patch.dict(os.environ, dict.fromkeys(THREADS, "1"))
+    with environment, patch.dict(sys.modules, {"__main__": main}):
+        yield

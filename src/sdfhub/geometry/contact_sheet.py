@@ -1,0 +1,77 @@
+"""Many pictures on one page: rows with labels, columns with captions."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+_INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[np.ndarray | None]],
+    row_labels: Sequence[str],
+    column_captions: Sequence[str],
+    path: str | os.PathLike,
+) -> Path:
+    """Lays pictures out as a grid and writes it as one PNG, whole or not at all.
+
+    Args:
+        rows: pictures [S, S, 3] uint8 of one size; None is a shape without a surface and gets a tile that says so.
+        row_labels: one text per row; [] for none.
+        column_captions: one text per column, written below the header line; [] for none.
+        path: where the PNG goes; its folder is made.
+
+    Returns:
+        The path written.
+    """
+    size = next((len(image) for row in rows for image in row if image is not None), 256)
+    columns = max((len(row) for row in rows), default=0)
+    font = ImageFont.load_default(max(11, size // 14))
+    left = int(max((font.getlength(label) for label in row_labels), default=0)) + 20 if row_labels else 6
+    top = size // 8 + 10 if column_captions else 6
+    page = Image.new("RGB", (left + columns * size + 6, top + len(rows) * size + 6), "white")
+    draw = ImageDraw.Draw(page)
+    for i, row in enumerate(rows):
+        for j, image in enumerate(row):
+            x, y = left + j * size, top + i * size
+            if image is None:
+                _no_surface(draw, x, y, size, font)
+            else:
+                page.paste(Image.fromarray(image), (x, y))
+    for i, label in enumerate(row_labels):
+        draw.text((10, top + (i + 0.5) * size), label, fill=_INK, font=font, anchor="lm")
+    for j, caption in enumerate(column_captions):
+        text = _shortened(caption, font, size - 8)
+        draw.text((left + (j + 0.5) * size, top / 2), text, fill=_INK, font=font, anchor="mm")
+    return _write_png(page, Path(path))
+
+
+def _no_surface(draw: ImageDraw.ImageDraw, x: int, y: int, size: int, font) -> None:
+    pad = size // 16
+    draw.rectangle((x + pad, y + pad, x + size - pad, y + size - pad), fill=_TILE, outline=_FAINT)
+    draw.text((x + size / 2, y + size / 2), "no surface", fill=_FAINT, font=font, anchor="mm")
+
+
+def _shortened(text: str, font, width: float) -> str:
+    if font.getlength(text) <= width:
+        return text
+    while text and font.getlength(text + "…") > width:
+        text = text[:-1]
+    return text + "…"
+
+
+def _write_png(page: Image.Image, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with open(part, "wb") as file:
+            page.save(file, format="PNG", optimize=False)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,170 @@
+"""Meshes to pictures by ray casting, without a display.
+
+Frame: +z up, shapes within the unit ball, their front towards -y. Colours are linear RGB in [0, 1] until the
+last step, which maps them to sRGB bytes.
+"""
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+CLAY = (0.42, 0.56, 0.78)
+"""Default surface colour, linear RGB."""
+
+_CREASE = np.cos(np.radians(38))  # edges sharper than this stay sharp
+_SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
+_KEY = np.array([-0.35, -0.65, 0.85])
+_FILL = np.array([0.9, -0.25, 0.25])
+
+
+def render(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    size: int = 256,
+    *,
+    azimuth: float = -55.0,
+    elevation: float = 24.0,
+    colour: tuple[float, float, float] = CLAY,
+    background: float = 1.0,
+    occlusion_rays: int = 6,
+) -> np.ndarray:
+    """A shaded picture of a mesh from a three-quarter view.
+
+    Both sides of a face are lit, so that holes and flipped faces stay visible as shape, not as black.
+
+    Args:
+        vertices: [V, 3], within the unit ball.
+        faces: [F, 3] rows of `vertices`; F = 0 gives the background.
+        size: width and height in pixels.
+        azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
+        elevation: height of the camera above the horizon in degrees.
+        colour: linear RGB of the surface, each in [0, 1].
+        background: sRGB grey level around the shape, in [0, 1].
+        occlusion_rays: ambient-occlusion rays per sample (four samples a pixel); 0 turns it off.
+
+    Returns:
+        [size, size, 3] uint8, sRGB.
+    """
+    image = np.full((2 * size * 2 * size, 3), background**2.2)
+    faces = np.asarray(faces)
+    if len(faces):
+        vertices = np.asarray(vertices, dtype=np.float64)
+        scene = EmbreeScene()
+        TriangleMesh(scene, vertices[faces].astype(np.float32))
+        origins, directions = _camera_rays(2 * size, azimuth, elevation)
+        hits = scene.run(origins, directions, query="INTERSECT", output=1)
+        seen = np.flatnonzero(hits["primID"] >= 0)
+        points = origins[seen] + hits["tfar"][seen, None] * directions[seen]
+        normals, flat = _normals(vertices, faces, hits, seen, directions[seen])
+        light = _light(scene, points, normals, flat, occlusion_rays)
+        image[seen] = np.asarray(colour) * light
+    image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+    return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
+
+
+def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
+    """A signed distance slice in colour: blue inside, orange outside, iso-lines every delta / 4, zero in black.
+
+    Args:
+        sdf_grid: [R, R], negative inside; the first index runs right, the second up.
+        delta: distance at which the colour saturates, > 0.
+
+    Returns:
+        [R, R, 3] uint8, sRGB.
+    """
+    sdf = np.asarray(sdf_grid, dtype=np.float64).T[::-1]
+    amount = np.clip(np.abs(sdf) / delta, 0, 1)[..., None]
+    inside, outside, paper = np.array([38, 84, 168]), np.array([214, 108, 24]), np.array([252, 250, 246])
+    image = paper + (np.where(sdf[..., None] < 0, inside, outside) - paper) * (0.15 + 0.85 * amount)
+    image[_changes(np.floor(np.clip(sdf, -delta, delta) / (delta / 4)))] *= 0.78
+    image[_changes(sdf < 0)] = 0
+    return np.nan_to_num(image).astype(np.uint8)
+
+
+def _changes(labels: np.ndarray) -> np.ndarray:
+    """Pixels whose right or lower neighbour has another label."""
+    edge = np.zeros(labels.shape, dtype=bool)
+    edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    edge[:-1] |= labels[:-1] != labels[1:]
+    return edge
+
+
+def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Perspective rays, row by row from the top left, that frame the unit ball."""
+    a, e = np.radians([azimuth, elevation])
+    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    up = np.cross(back, right)
+    distance = 5.0
+    half = 1.0 / np.sqrt(distance**2 - 1)  # tangent of the ball's half angle
+    steps = (np.arange(pixels) + 0.5) / pixels * 2 - 1
+    x, y = np.meshgrid(steps * half, -steps * half)
+    directions = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up - back
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(distance * back, directions.shape)
+    return origins.astype(np.float32), directions.astype(np.float32)
+
+
+def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed and flat unit normals at the hits, both turned towards the camera."""
+    cross = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    of_face = _unit(cross)
+    face = hits["primID"][seen]
+    flat = of_face[face]
+    if len(faces) > _SMOOTH_FACES:
+        smooth = flat
+    else:
+        corners = _corner_normals(faces, cross, of_face)[face]
+        u, v = hits["u"][seen, None], hits["v"][seen, None]
+        smooth = _unit((1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2])
+    away = np.einsum("ij,ij->i", flat, directions) > 0
+    sign = np.where(away, -1.0, 1.0)[:, None]
+    return smooth * sign, flat * sign
+
+
+def _corner_normals(faces: np.ndarray, cross: np.ndarray, of_face: np.ndarray) -> np.ndarray:
+    """[F, 3, 3] unit normals per corner: the area-weighted mean over neighbours within the crease angle."""
+    order = np.argsort(faces.ravel(), kind="stable")
+    valence = np.bincount(faces.ravel())
+    valence = valence[valence > 0]
+    start = np.repeat(np.cumsum(valence) - valence, valence)  # first corner of this corner's vertex
+    count = np.repeat(valence, valence)
+    total = np.zeros((faces.size, 3))
+    own = order // 3
+    for k in range(valence.max()):
+        rows = np.flatnonzero(count > k)
+        other = own[start[rows] + k]
+        near = np.einsum("ij,ij->i", of_face[own[rows]], of_face[other]) > _CREASE
+        total[rows[near]] += cross[other[near]]
+    corners = np.empty_like(total)
+    corners[order] = _unit(total)
+    return corners.reshape(-1, 3, 3)
+
+
+def _light(scene, points, normals, flat, rays: int) -> np.ndarray:
+    """[N, 3] light that reaches each point: key with a cast shadow, fill, and sky with ambient occlusion."""
+    start = (points + 2e-3 * flat).astype(np.float32)
+    key = np.clip(normals @ _unit(_KEY), 0, None)
+    fill = np.clip(normals @ _unit(_FILL), 0, None)
+    sky = 0.5 + 0.5 * normals[:, 2]
+    rng = np.random.default_rng(0)
+    wide = _unit(_unit(_KEY) + 0.12 * rng.normal(size=points.shape))  # an area light: soft shadow edges
+    key = key * _free(scene, start, wide)
+    open_share = 1.0
+    if rays:
+        blocked = np.zeros(len(points))
+        for _ in range(rays):
+            blocked += 1 - _free(scene, start, _unit(normals + 0.98 * _unit(rng.normal(size=points.shape))))
+        open_share = 1 - blocked / rays
+    warm, cool = np.array([1.0, 0.96, 0.9]), np.array([0.86, 0.93, 1.0])
+    ambient = (0.35 + 0.35 * sky) * open_share
+    return 0.85 * key[:, None] * warm + (0.18 * fill + ambient)[:, None] * cool
+
+
+def _free(scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """1 where a ray meets nothing, 0 where it is blocked."""
+    return (scene.run(origins, directions.astype(np.float32), query="OCCLUDED") < 0).astype(np.float64)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)

@@ -1,0 +1,104 @@
+"""Nonlinearities of the decoder, one instance per hidden layer.
+
+Each rival is a module with two duties: `forward`, and `weight_bound`, the half-width of the uniform
+distribution from which the weights of the linear layer before it are drawn.
+"""
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+
+class Activation(nn.Module, ABC):
+    """An elementwise nonlinearity that knows how the layer before it must be initialised.
+
+    Args:
+        first: whether it follows the layer that reads the encoded points.
+    """
+
+    def __init__(self, first: bool = False):
+        super().__init__()
+        self.first = first
+
+    @abstractmethod
+    def weight_bound(self, fan_in: int) -> float:
+        """Half-width b of U(-b, b), the initial weights of the layer before, for `fan_in` inputs."""
+
+    def monitored(self) -> dict[str, float]:
+        """Numbers worth a curve while training, by name; none by default."""
+        return {}
+
+
+class Relu(Activation):
+    """max(0, x), initialised as PyTorch's linear layers are (DeepSDF's choice)."""
+
+    def weight_bound(self, fan_in: int) -> float:
+        return 1 / math.sqrt(fan_in)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(x)
+
+
+class Siren(Activation):
+    """sin(omega x), with one omega for the first layer and one for the others.
+
+    Source: Sitzmann et al. 2020, section 3.2: first layer U(-1/n, 1/n), others U(+-sqrt(6/n) / omega).
+
+    Args:
+        omega_0: frequency factor of the first layer, > 0.
+        omega_hidden: frequency factor of every other layer, > 0.
+        first: whether it follows the layer that reads the encoded points.
+    """
+
+    def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
+        super().__init__(first)
+        self.omega = omega_0 if first else omega_hidden
+        if self.omega <= 0:
+            raise ValueError(f"omega_0 and omega_hidden must be positive, got {self.omega}")
+
+    def weight_bound(self, fan_in: int) -> float:
+        return 1 / fan_in if self.first else math.sqrt(6 / fan_in) / self.omega
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.sin(self.omega * x)
+
+    def monitored(self) -> dict[str, float]:
+        return {"omega": self.omega}
+
+
+class Hosc(Siren):
+    """tanh(beta sin(omega x)), with a learnable sharpness beta > 0 per layer.
+
+    beta is kept positive by learning its logarithm. The gain of a layer grows with beta (about 1.4 at 2,
+    1.9 at 4, with SIREN's initialisation), so a deep decoder needs a small one.
+
+    Source: the paper's equation for HOSC (Serrano et al. 2024).
+
+    Args:
+        omega_0: frequency factor of the first layer, > 0.
+        omega_hidden: frequency factor of every other layer, > 0.
+        beta: initial sharpness, > 0; near 0 a scaled sine, large a square wave.
+        learn_beta: whether beta is trained with the decoder's weights.
+        first: whether it follows the layer that reads the encoded points.
+    """
+
+    def __init__(
+        self, omega_0: float, omega_hidden: float, beta: float, learn_beta: bool = True, first: bool = False
+    ):
+        super().__init__(omega_0, omega_hidden, first)
+        if beta <= 0:
+            raise ValueError(f"beta must be positive, got {beta}")
+        self.log_beta = nn.Parameter(torch.tensor(math.log(beta)), requires_grad=learn_beta)
+
+    @property
+    def beta(self) -> Tensor:
+        """Sharpness of this layer: a positive scalar tensor."""
+        return self.log_beta.exp()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.tanh(self.beta * torch.sin(self.omega * x))
+
+    def monitored(self) -> dict[str, float]:
+        return {"omega": self.omega, "beta": self.beta.item()}

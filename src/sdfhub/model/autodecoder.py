@@ -1,0 +1,94 @@
+"""The LightningModule: wires decoder, codes, loss and optimiser, and logs. No formula lives here."""
+
+import time
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.model.codes import CodeTable
+from sdfhub.model.decoder import Decoder
+from sdfhub.model.losses import SdfLoss, spatial_gradient
+from sdfhub.model.optim import Adam
+from sdfhub.shapes import Batch
+
+
+class AutoDecoder(L.LightningModule):
+    """A decoder and a table of codes, trained together on batches of shapes.
+
+    Source: Park et al. 2019, section 4.2; the paper's final loss.
+
+    Args:
+        decoder: f_theta(x, z).
+        codes: one row per training shape.
+        loss: the objective and its weights.
+        optim: makes the optimiser and its schedule.
+        seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
+            run repeats an uninterrupted one.
+    """
+
+    def __init__(self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, seed: int = 0):
+        super().__init__()
+        self.decoder, self.codes = decoder, codes
+        self.loss, self.optim, self.seed = loss, optim, seed
+        self._step_started = time.perf_counter()
+
+    def forward(self, points: Tensor, rows: Tensor) -> Tensor:
+        """Signed distances [B, N] at points [B, N, 3], normalised frame, of the shapes in table rows [B]."""
+        return self.decoder(points, self.codes(rows))
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        torch.manual_seed((self.seed << 32) + self.global_step)
+        self._step_started = time.perf_counter()
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        codes = self.codes(batch.rows)
+        predicted = self.decoder(batch.points, codes)
+        gradients = None
+        if batch.surface_points.shape[1] and self.loss.wants_gradients(self.progress):
+            _, gradients = spatial_gradient(lambda x: self.decoder(x, codes), batch.surface_points)
+        epoch = self.global_step / max(self.trainer.num_training_batches, 1)
+        parts = self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
+        loss = torch.stack(tuple(parts.values())).sum()
+        if not torch.isfinite(loss):
+            raise SdfhubError(self._divergence(parts))
+        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
+            self._log(batch, parts, loss, codes)
+        return loss
+
+    @property
+    def progress(self) -> float:
+        """Share of training done, in [0, 1]."""
+        return self.global_step / self.steps
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps of the whole training."""
+        return int(self.trainer.estimated_stepping_batches)
+
+    def configure_optimizers(self):
+        optimizer, schedule = self.optim.configure(
+            self.decoder.parameters(), self.codes.parameters(), self.steps
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _divergence(self, parts: dict[str, Tensor]) -> str:
+        culprits = ", ".join(name for name, part in parts.items() if not torch.isfinite(part)) or "their sum"
+        return (
+            f"loss is not finite at step {self.global_step} ({culprits}): the run diverged; "
+            "lower optim.lr_decoder, activation.omega_0 or activation.beta, or loss.tau"
+        )
+
+    def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor, codes: Tensor) -> None:
+        values = {f"loss/{name}": part.detach() for name, part in parts.items()} | {"loss/total": loss.detach()}
+        values["codes/norm"] = codes.detach().norm(dim=-1).mean()
+        for group in self.optimizers().param_groups:
+            values[f"lr/{group['name']}"] = group["lr"]
+        for index, activation in enumerate(self.decoder.activations):
+            values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
+        self.log_dict({name: float(value) for name, value in values.items()})
+
+    def on_train_batch_end(self, outputs, batch: Batch, batch_idx: int) -> None:
+        seconds = time.perf_counter() - self._step_started
+        self.log("speed/samples_per_second", batch.sdf.numel() / seconds)

@@ -1,0 +1,35 @@
+"""The table of latent codes: one row z per training shape."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class CodeTable(nn.Module):
+    """Learned codes, started at N(0, 1 / L), so that their expected norm is 1.
+
+    Source: Park et al. 2019, section 4.2; `max_norm` as in its published code.
+
+    Args:
+        shapes: S, number of rows.
+        size: L, numbers in a code.
+        max_norm: longest norm a code may have when it is read, or None for no limit.
+    """
+
+    def __init__(self, shapes: int, size: int, max_norm: float | None = None):
+        super().__init__()
+        if shapes < 1 or size < 1:
+            raise ValueError(f"a code table needs shapes >= 1 and size >= 1, got {shapes} and {size}")
+        if max_norm is not None and max_norm <= 0:
+            raise ValueError(f"max_norm must be positive or null, got {max_norm}")
+        self.max_norm = max_norm
+        self.table = nn.Parameter(torch.randn(shapes, size) / math.sqrt(size))
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Codes [B, L] of table rows [B]."""
+        if self.max_norm is not None:
+            with torch.no_grad():
+                read = self.table[rows]
+                self.table[rows] = read * (self.max_norm / read.norm(dim=1, keepdim=True)).clamp(max=1)
+        return self.table[rows]

@@ -1,0 +1,124 @@
+"""The decoder f_theta(x, z): an MLP from encoded points and a shape's code to a signed distance."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
+
+from sdfhub.model.activations import Activation
+from sdfhub.model.encodings import Encoding
+
+HEAD_SPREAD = 0.03
+"""Standard deviation of the initial output for hidden units of size 1: well inside the clamp delta = 0.1."""
+
+
+class Layer(nn.Module):
+    """A linear layer over [hidden | encoding | code] that never copies the code once per point.
+
+    The code's columns act once per shape; their result, with the bias, is broadcast over its points.
+
+    Args:
+        hidden, encoding, code: number of input columns of each part; 0 leaves the part out.
+        outputs: number of output features.
+    """
+
+    def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
+        super().__init__()
+        self.columns = [hidden, encoding, code]
+        self.linear = nn.Linear(sum(self.columns), outputs)
+
+    def forward(self, hidden: Tensor | None, encoded: Tensor, codes: Tensor) -> Tensor:
+        """[B, N, outputs] from hidden [B, N, H] (None in the first layer), encoded [B, N, F], codes [B, L]."""
+        from_hidden, from_encoding, from_code = self.linear.weight.split(self.columns, dim=1)
+        shift = self.linear.bias if not self.columns[2] else F.linear(codes, from_code, self.linear.bias)
+        shift = shift if shift.dim() == 1 else shift[:, None, :]
+        inputs, weight = encoded, from_encoding
+        if self.columns[0]:
+            inputs, weight = hidden, from_hidden
+            if self.columns[1]:
+                shift = shift + F.linear(encoded, from_encoding)
+        return F.linear(inputs, weight) + shift
+
+
+class Decoder(nn.Module):
+    """Signed distances of B shapes at N points each.
+
+    Source: Park et al. 2019, figure 4 and its published code (re-injection shortens the layer before, so
+    that every layer reads `width` features); the paper re-injects its encoding into every layer.
+
+    Args:
+        encoding: maps points to F features.
+        activation: makes one activation per hidden layer, called with `first=True` for the first.
+        code_size: L.
+        depth: number of hidden layers, >= 1.
+        width: W, features that a hidden layer reads and emits.
+        inject_encoding: layers (1 ... depth, `depth` is the output layer) that read the encoding again.
+        inject_code: layers that read the code again.
+        shorten: whether the layer before a re-injection emits that much less than `width`.
+        weight_norm: whether hidden layers are split into direction and length.
+        dropout: probability in [0, 1) of dropping a hidden unit while training.
+        tanh: whether the output passes through tanh, as in DeepSDF's code.
+    """
+
+    def __init__(
+        self,
+        encoding: Encoding,
+        activation: Callable[..., Activation],
+        code_size: int,
+        depth: int,
+        width: int,
+        inject_encoding: Sequence[int] = (),
+        inject_code: Sequence[int] = (),
+        shorten: bool = True,
+        weight_norm: bool = True,
+        dropout: float = 0.0,
+        tanh: bool = False,
+    ):
+        super().__init__()
+        if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
+            raise ValueError("decoder: depth, width and code_size must be at least 1, dropout in [0, 1)")
+        if not set(inject_encoding) | set(inject_code) <= set(range(1, depth + 1)):
+            raise ValueError(f"decoder: inject_encoding and inject_code name layers 1 to {depth}")
+        self.encoding, self.code_size = encoding, code_size
+        self.dropout, self.tanh = dropout, tanh
+        self.activations = nn.ModuleList(activation(first=index == 0) for index in range(depth))
+        self.layers = nn.ModuleList()
+        hidden = 0
+        for index in range(depth + 1):
+            encoded = encoding.features if index == 0 or index in inject_encoding else 0
+            code = code_size if index == 0 or index in inject_code else 0
+            after = encoding.features * (index + 1 in inject_encoding) + code_size * (index + 1 in inject_code)
+            outputs = 1 if index == depth else width - after * shorten
+            if outputs < 1:
+                raise ValueError(
+                    f"decoder: width {width} leaves no room for {after} re-injected features; "
+                    "widen it, encode with fewer features, or set shorten=false"
+                )
+            self.layers.append(Layer(hidden, encoded, code, outputs))
+            hidden = outputs
+        self._initialize()
+        if weight_norm:
+            for layer in self.layers[:-1]:
+                with_weight_norm(layer.linear)  # after the weights are drawn, so that their law is kept
+
+    @torch.no_grad()
+    def _initialize(self) -> None:
+        for layer, activation in zip(self.layers, self.activations, strict=False):
+            bound = activation.weight_bound(layer.linear.in_features)
+            layer.linear.weight.uniform_(-bound, bound)
+        head = self.layers[-1].linear
+        head.weight.normal_(0, HEAD_SPREAD / head.in_features**0.5)
+        head.bias.zero_()
+
+    def forward(self, points: Tensor, codes: Tensor) -> Tensor:
+        """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
+        encoded = self.encoding(points)
+        hidden = None
+        for layer, activation in zip(self.layers, self.activations, strict=False):
+            hidden = activation(layer(hidden, encoded, codes))
+            if self.dropout:
+                hidden = F.dropout(hidden, self.dropout, self.training)
+        sdf = self.layers[-1](hidden, encoded, codes).squeeze(-1)
+        return torch.tanh(sdf) if self.tanh else sdf

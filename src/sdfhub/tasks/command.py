@@ -1,0 +1,24 @@
+"""The console command `sdfhub TASK key=value ...`: one Hydra app per task."""
+
+import importlib
+import sys
+
+TASKS = {
+    "train": "learns a shape space: sdfhub train activation=hosc encoding=fourier",
+    "prepare": "makes samples ahead of time: sdfhub prepare data=open category=chairs",
+    "evaluate": "judges a finished run again: sdfhub evaluate run=RUN evaluate.resolution=512",
+}
+
+
+def main() -> None:
+    """Runs the task that the first argument names with the rest of the command line."""
+    task = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if task in ("-h", "--help"):
+        print("usage: sdfhub TASK [key=value ...]\n")
+        print("\n".join(f"  {name:<10}{about}" for name, about in TASKS.items()))
+        return
+    if task not in TASKS:
+        print(f"sdfhub: error: there is no task {task!r}; choose {', '.join(TASKS)}", file=sys.stderr)
+        sys.exit(2)
+    del sys.argv[1]
+    importlib.import_module(f"sdfhub.tasks.{task}").main()

@@ -1,0 +1,67 @@
+"""Task `prepare`: shapes of a source become samples in the store. Training calls the same on demand."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import DictConfig
+
+from sdfhub.data import store as stores
+from sdfhub.data.shards import StoredShape
+from sdfhub.data.splits import Split, split
+from sdfhub.data.store import Store
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import build, check, plain
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Stored shapes by role; rejected ones have already left."""
+
+    train: list[StoredShape]
+    held_out: list[StoredShape]
+    store: Store
+
+
+def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
+    """Lists, splits and prepares the shapes that the config's `data` group asks for; prints what came of it.
+
+    Args:
+        data: the plain `data` group.
+        progress: show a bar.
+    """
+    source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
+    roles = split(
+        source.shapes(),
+        train=check(data["shapes"], int | None, "data.shapes"),
+        test=check(data["held_out"], int, "data.held_out"),
+        seed=check(data["split_seed"], int, "data.split_seed"),
+    )
+    return prepare_split(source, roles, preparation, data, progress)
+
+
+def prepare_split(source, roles: Split, preparation, data: Mapping[str, Any], progress: bool = True) -> Prepared:
+    """The stored shapes of a given split."""
+    store = stores.prepare(
+        source,
+        roles.train + roles.test,
+        preparation,
+        root=check(data["root"], str, "data.root"),
+        workers=check(data["workers"], int | None, "data.workers"),
+        progress=progress,
+    )
+    train = [store[shape.id] for shape in roles.train if shape.id in store]
+    held_out = [store[shape.id] for shape in roles.test if shape.id in store]
+    print(f"data: {source.name}: {len(train)} shapes to train on, {len(held_out)} held out")
+    print(f"store: {store.folder}: {store.summary()}")
+    return Prepared(train, held_out, store)
+
+
+def main() -> None:
+    """Console entry: `sdfhub prepare data=open category=chairs data.shapes=null`."""
+
+    def task(config: DictConfig) -> None:
+        prepare_data(plain(config)["data"])
+
+    run_task(task, "prepare")

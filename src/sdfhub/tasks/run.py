@@ -1,0 +1,92 @@
+"""A run's folder: what training leaves behind and every later task starts from. Plain data only.
+
+    config.yaml       the composed config, interpolations resolved
+    split.json        ids of the shapes by role; training ids in the order of the code table
+    checkpoints/      last.ckpt and its predecessors
+    metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
+"""
+
+import json
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from sdfhub.errors import SdfhubError
+from sdfhub.model.autodecoder import AutoDecoder
+from sdfhub.tasks.build import build
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file whole or not at all: beside its place, then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        with beside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def begin_run(run: Path, config: dict[str, Any], train: list[str], held_out: list[str]) -> None:
+    """Writes down what a run is made of, before it starts."""
+    write_text(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_text(run / "split.json", json.dumps({"train": train, "held_out": held_out}, indent=1))
+
+
+def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
+    """The config and the split of a run's folder.
+
+    Raises:
+        SdfhubError: it is not a run's folder, or one of the files is broken.
+    """
+    try:
+        config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        split = json.loads((run / "split.json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SdfhubError(f"run={run}: not a run's folder ({error.strerror}: {error.filename})") from error
+    except (ValueError, yaml.YAMLError) as error:
+        raise SdfhubError(f"run={run}: config.yaml or split.json is broken: {error}") from error
+    if not isinstance(config, dict) or set(split) != {"train", "held_out"}:
+        raise SdfhubError(f"run={run}: config.yaml or split.json is not what training writes")
+    return config, split
+
+
+def build_autodecoder(config: dict[str, Any], rows: int) -> AutoDecoder:
+    """The untrained model that a plain config describes, with `rows` codes. Seeds the weights."""
+    torch.manual_seed(config["seed"])
+    return AutoDecoder(
+        decoder=build(config["decoder"], "decoder", within="sdfhub.model"),
+        codes=build(config["codes"], "codes", within="sdfhub.model")(shapes=rows),
+        loss=build(config["loss"], "loss", within="sdfhub.model"),
+        optim=build(config["optim"], "optim", within="sdfhub.model"),
+        seed=config["seed"],
+    )
+
+
+def load_autodecoder(run: Path, config: dict[str, Any], rows: int) -> AutoDecoder:
+    """The trained model of a run, on the CPU, in evaluation mode. Runs no code of the checkpoint.
+
+    Raises:
+        SdfhubError: no readable checkpoint, or one of another model.
+    """
+    path = run / "checkpoints" / "last.ckpt"
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+    except FileNotFoundError as error:
+        raise SdfhubError(f"{path}: there is no checkpoint; has the run trained to the end?") from error
+    except Exception as error:  # torch names a dozen kinds of damage
+        raise SdfhubError(f"{path}: not a readable checkpoint: {str(error).splitlines()[0]}") from error
+    model = build_autodecoder(config, rows)
+    try:
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        detail = str(error).splitlines()[-1].strip()
+        raise SdfhubError(f"{path}: does not fit the model of config.yaml: {detail}") from error
+    return model.eval()

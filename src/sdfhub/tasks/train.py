@@ -1,0 +1,70 @@
+"""Task `train`: samples in, a shape space out, and the table that judges it."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig
+
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.evaluate import evaluate_model
+from sdfhub.tasks.prepare import prepare_data
+from sdfhub.tasks.run import begin_run, build_autodecoder
+
+
+def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
+    """Trains what a plain config describes into the folder `run`; returns the evaluation's summary.
+
+    Every part is built, and so checked, before the first shape is prepared.
+    """
+    config["seed"] = check(config["seed"], int, "seed")
+    checkpoint = _existing_checkpoint(check(config["ckpt_path"], str | None, "ckpt_path"))
+    evaluation = build(config["evaluate"], "evaluate")
+    callbacks = {name: build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()}
+    make_trainer = build(config["trainer"], "trainer", within="lightning.pytorch")
+    make_loader = build(config["data"]["loader"], "data.loader")
+    build_autodecoder(config, rows=1)
+
+    prepared = prepare_data(config["data"])
+    loader = make_loader(shapes=prepared.train)
+    model = build_autodecoder(config, loader.rows)
+    begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
+    for callback in callbacks.values():
+        if hasattr(callback, "truth"):
+            callback.truth = prepared.train
+    trainer = make_trainer(
+        default_root_dir=run,
+        logger=TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
+        callbacks=[*callbacks.values(), _checkpointing(run)],
+    )
+    print(f"run: {run}")
+    trainer.fit(model, datamodule=loader, ckpt_path=checkpoint, weights_only=True)
+    return evaluate_model(model, prepared.train, prepared.held_out, evaluation, run, trainer.logger)
+
+
+def _checkpointing(run: Path) -> ModelCheckpoint:
+    """The newest state after every epoch; an epoch is a whole number of passes, so a resume is exact."""
+    return ModelCheckpoint(run / "checkpoints", filename="last", save_top_k=1, enable_version_counter=False)
+
+
+def _existing_checkpoint(path: str | None) -> str | None:
+    if path is not None and not Path(path).is_file():
+        raise SdfhubError(f"ckpt_path={path}: there is no such file; a run keeps checkpoints/last.ckpt")
+    return path
+
+
+def main() -> None:
+    """Console entry: `python train.py activation=hosc encoding=fourier`."""
+    warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
+
+    def task(config: DictConfig) -> None:
+        train(plain(config), Path(HydraConfig.get().runtime.output_dir))
+
+    run_task(task, "config")

@@ -1,0 +1,256 @@
+"""The store of prepared shapes: whole, reused, independent of order and workers."""
+
+import dataclasses
+import os
+import pickle
+import time
+
+import numpy as np
+import pytest
+
+from sdfhub.data import shards, store
+from sdfhub.data.sampling import Preparation
+from sdfhub.data.sources.source import Shape, Source
+from sdfhub.data.store import Store, prepare
+from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.shapes import NormalizedMesh, ShapeSamples
+
+SETTINGS = Preparation()
+
+
+class Balls(Source):
+    """Ready-made samples of spheres, with a few that misbehave by name."""
+
+    name = "balls"
+
+    def __init__(self, count: int = 4, bad: dict[str, str] | None = None):
+        self.bad = bad or {}
+        ids = [f"balls/{index:04d}" for index in range(count)] + sorted(self.bad)
+        self.listed = [Shape(id, "balls", f"v1 {id}", credits={"author": "A", "licence": "B"}) for id in ids]
+
+    def shapes(self) -> list[Shape]:
+        return self.listed
+
+    def load(self, shape: Shape) -> ShapeSamples:
+        match self.bad.get(shape.id):
+            case "reject":
+                raise RejectedMesh("few_faces", "3 faces")
+            case "raise":
+                raise ZeroDivisionError("surprise")
+            case "die":
+                os._exit(9)
+        return ball(seed=store.shape_seed(shape))
+
+
+def ball(seed: int, rows: int = 300) -> ShapeSamples:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (rows, 3)).astype(np.float32)
+    sdf = (np.linalg.norm(points, axis=1) - 0.9).astype(np.float32)
+    normals = rng.normal(size=(50, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    corners = np.array([[0.9, 0, 0], [0, 0.9, 0], [0, 0, 0.9], [0, 0, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int64)
+    center = np.array([1.0, 2.0, 3.0])
+    mesh = NormalizedMesh(corners, faces, center, 2.0)
+    return ShapeSamples(points, sdf, 0.9 * normals, normals, center, 2.0, mesh, {"inside": 0.4})
+
+
+def fill(root, source, **settings) -> Store:
+    settings = {"preparation": SETTINGS, "workers": 1, "progress": False} | settings
+    return prepare(source, source.shapes(), root=root, **settings)
+
+
+def content(prepared: Store) -> dict[str, bytes]:
+    files = sorted(prepared.folder.rglob("*.npy"))
+    return {str(file.relative_to(prepared.folder)): file.read_bytes() for file in files}
+
+
+def test_rows_are_kept_and_parted_by_sign(tmp_path):
+    source = Balls(1)
+    shape = fill(tmp_path, source)["balls/0000"]
+    samples = source.load(source.listed[0])
+    rows = np.column_stack([samples.points, samples.sdf])
+    kept = np.concatenate([shape.outside, shape.inside])
+    assert (shape.outside[:, 3] >= 0).all() and (shape.inside[:, 3] < 0).all()
+    assert np.array_equal(np.unique(kept, axis=0), np.unique(rows, axis=0))
+    assert not np.array_equal(shape.outside, rows[rows[:, 3] >= 0])  # shuffled
+    pairs = {tuple(row) for row in np.column_stack([samples.surface_points, samples.surface_normals])}
+    assert {tuple(row) for row in shape.surface} == pairs  # point and normal stay together
+    assert shape.rows("surface") == 50 and shape.statistics == {"inside": 0.4}
+
+
+def test_mesh_and_frame_survive(tmp_path):
+    shape = fill(tmp_path, Balls(1))["balls/0000"]
+    expected = ball(0).mesh
+    assert np.array_equal(shape.mesh.vertices, expected.vertices) and shape.mesh.faces.dtype == np.int64
+    assert np.array_equal(shape.mesh.faces, expected.faces)
+    assert shape.scale == 2.0 and shape.center.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_neither_order_nor_workers_change_a_byte(tmp_path):
+    source = Balls(3)
+    here = fill(tmp_path / "a", source)
+    source.listed = source.listed[::-1]
+    there = fill(tmp_path / "b", source, workers=2)
+    assert content(here) == content(there) and len(content(here)) == 15
+
+
+def test_second_run_loads_nothing(tmp_path, monkeypatch):
+    source = Balls(3)
+    fill(tmp_path, source)
+    monkeypatch.setattr(Balls, "load", lambda *_: pytest.fail("loaded again"))
+    assert fill(tmp_path, source).ids == ["balls/0000", "balls/0001", "balls/0002"]
+
+
+def test_a_changed_fingerprint_prepares_that_shape_again(tmp_path, monkeypatch):
+    source = Balls(3)
+    before = fill(tmp_path, source)
+    source.listed[1] = dataclasses.replace(source.listed[1], fingerprint="v2")
+    loaded = []
+    load = Balls.load
+    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or load(self, shape))
+    after = fill(tmp_path, source)
+    assert loaded == ["balls/0001"] and after.folder == before.folder
+    assert after["balls/0001"].fingerprint == "v2"
+
+
+def test_every_setting_and_the_version_change_the_folder(monkeypatch):
+    hashes = {store.preparation_hash(SETTINGS)}
+    for field in dataclasses.fields(Preparation):
+        value = getattr(SETTINGS, field.name)
+        other = {bool: lambda v: not v, str: lambda v: v + "x", tuple: lambda v: (9.0, *v[1:])}
+        changed = other.get(type(value), lambda v: v + 1)(value)
+        twin = object.__new__(Preparation)  # past the checks of its values, which are not at stake here
+        twin.__dict__.update(vars(SETTINGS) | {field.name: changed})
+        hashes.add(store.preparation_hash(twin))
+    assert len(hashes) == len(dataclasses.fields(Preparation)) + 1
+    monkeypatch.setattr(store, "VERSION", store.VERSION + 1)
+    assert store.preparation_hash(SETTINGS) not in hashes
+
+
+def test_one_bad_mesh_costs_only_itself(tmp_path):
+    source = Balls(2, bad={"balls/few": "reject", "balls/odd": "raise"})
+    prepared = fill(tmp_path, source)
+    assert prepared.ids == ["balls/0000", "balls/0001"]
+    assert prepared.rejected["balls/few"]["reason"] == "few_faces"
+    assert prepared.rejected["balls/odd"]["reason"] == "error"
+    assert "surprise" in prepared.summary() and "2 shapes kept, 2 rejected" in prepared.summary()
+    with pytest.raises(SdfhubError, match="few_faces"):
+        prepared["balls/few"]
+
+
+def test_a_dying_worker_costs_only_its_shape(tmp_path):
+    prepared = fill(tmp_path, Balls(3, bad={"balls/0000x": "die"}), workers=2)
+    assert len(prepared) == 3 and prepared.rejected["balls/0000x"]["reason"] == "crash"
+
+
+def test_rejections_are_remembered_and_accidents_tried_again(tmp_path, monkeypatch):
+    source = Balls(1, bad={"balls/few": "reject", "balls/odd": "raise"})
+    fill(tmp_path, source)
+    loaded = []
+    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or ball(1))
+    assert len(fill(tmp_path, source)) == 2 and loaded == ["balls/odd"]
+
+
+def test_a_store_with_nothing_usable_is_an_error(tmp_path):
+    with pytest.raises(SdfhubError, match=r"none of the 1 shapes .* few_faces"):
+        fill(tmp_path, Balls(0, bad={"balls/few": "reject"}))
+
+
+def test_a_killed_run_keeps_whole_shapes_only(tmp_path, monkeypatch):
+    source = Balls(3)
+    folder = fill(tmp_path, source).folder
+    (folder / store.MANIFEST).unlink()  # killed before it was written
+    (folder / "balls/0001/shape.json").unlink()  # cannot happen by a rename, but by a disk
+    cut = folder / "balls/0002/inside.npy"
+    cut.write_bytes(cut.read_bytes()[:-8])
+    loaded = []
+    load = Balls.load
+    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or load(self, shape))
+    prepared = fill(tmp_path, source)
+    assert loaded == ["balls/0001", "balls/0002"] and len(prepared) == 3
+    assert not any(shape.damaged() for shape in prepared)
+    assert not [path for path in folder.rglob(".*") if path.name != ".lock"]  # nothing half left over
+
+
+def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(shards.os, "fsync", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(SdfhubError, match="disk full"):
+        fill(tmp_path, Balls(1))
+    assert not list(tmp_path.rglob("*.npy")) and not list(tmp_path.rglob("*.json"))
+
+
+@pytest.mark.parametrize("damage", ["cut", "shape", "dtype", "gone", "pickle"])
+def test_a_damaged_file_is_named(tmp_path, damage):
+    prepared = fill(tmp_path, Balls(1))
+    path = prepared.folder / "balls/0000/outside.npy"
+    rows = np.load(path)
+    match damage:
+        case "cut":
+            path.write_bytes(path.read_bytes()[:-100])
+        case "gone":
+            path.unlink()
+        case "pickle":
+            np.save(path, np.array([{}], dtype=object), allow_pickle=True)
+        case _:
+            np.save(path, rows[1:] if damage == "shape" else rows.astype(np.float64))
+    with pytest.raises(SdfhubError, match=r"outside\.npy.*prepare again"):
+        _ = Store.open(prepared.folder, ["balls/0000"])["balls/0000"].outside
+    assert prepared["balls/0000"].damaged() == ["outside"]
+
+
+def test_opening_asks_for_known_shapes_and_a_manifest(tmp_path):
+    prepared = fill(tmp_path, Balls(2))
+    assert Store.open(prepared.folder).ids == prepared.ids
+    assert Store.open(prepared.folder, ["balls/0001"]).ids == ["balls/0001"]
+    with pytest.raises(SdfhubError, match="balls/0007 has not been prepared"):
+        Store.open(prepared.folder, ["balls/0007"])
+    with pytest.raises(SdfhubError, match="prepare"):
+        Store.open(tmp_path / "nowhere", [])
+    (prepared.folder / store.MANIFEST).write_text("{]")
+    with pytest.raises(SdfhubError, match="manifest"):
+        Store.open(prepared.folder, [])
+
+
+def test_shapes_pickle_without_their_arrays(tmp_path):
+    shape = fill(tmp_path, Balls(1))["balls/0000"]
+    rows = shape.outside[:5].copy()
+    sent = pickle.dumps(shape)
+    assert len(sent) < 4000 and np.array_equal(pickle.loads(sent).outside[:5], rows)
+
+
+def test_empty_arrays_have_their_columns(tmp_path, monkeypatch):
+    none = np.zeros((0, 3), dtype=np.float32)
+    bare = dataclasses.replace(ball(0), surface_points=none, surface_normals=none, mesh=None)
+    monkeypatch.setattr(Balls, "load", lambda *_: bare)
+    shape = fill(tmp_path, Balls(1))["balls/0000"]
+    assert shape.surface.shape == (0, 6) and shape.mesh is None
+
+
+def test_a_thousand_shapes_open_fast_and_hold_no_files(tmp_path):
+    prepared = fill(tmp_path, Balls(1))
+    manifest = store._read_manifest(prepared.folder)
+    record = manifest["shapes"]["balls/0000"]
+    source = Balls(1000)
+    manifest["shapes"] = {shape.id: record | {"fingerprint": shape.fingerprint} for shape in source.listed}
+    store._write_manifest(prepared.folder, manifest)
+    start = time.perf_counter()
+    many = fill(tmp_path, source)
+    assert len(many) == 1000 and time.perf_counter() - start < 2
+    held = [many["balls/0000"].outside[:1] for _ in range(3)]
+    del held
+    assert not [f for f in os.listdir("/proc/self/fd") if _is_shard(f)]
+
+
+def _is_shard(descriptor: str) -> bool:
+    try:
+        return os.readlink(f"/proc/self/fd/{descriptor}").endswith(".npy")
+    except OSError:
+        return False
+
+
+def test_manifest_lists_authors_and_settings(tmp_path):
+    prepared = fill(tmp_path, Balls(3))
+    manifest = store._read_manifest(prepared.folder)
+    assert manifest["credits"] == [{"author": "A", "licence": "B", "shapes": 3}]
+    assert manifest["preparation"] and manifest["version"] == store.VERSION
