@@ -8,8 +8,8 @@ from sdfhub.data.preparation import Preparation
 from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import RADIUS, NormalizedMesh
 
-ZERO_AREA = 1e-13
-"""Area below which a triangle counts as none, normalised units squared (a sliver of 1e-6 by 2e-7)."""
+ZERO_AREA = 1e-15
+"""Area below which a triangle counts as none, normalised units squared: what rounding alone leaves of a line."""
 
 
 def normalize_mesh(

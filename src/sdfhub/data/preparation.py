@@ -31,8 +31,8 @@ class Preparation:
         min_certain: share of the samples whose sign is certain (winding: |w - 0.5| > 0.25).
         min_inside: share of the samples that lie inside.
         max_inside: share of the samples that lie inside.
-        max_contradictory: share of sightings on the wrong side of faces that are not sheets.
-        max_bad_faces: share of these faces with more than a tenth of their sightings on the wrong side.
+        max_contradictory: share of sightings on the less seen side of their face (sign=vote only).
+        max_bad_faces: share of the visible area with more than a tenth of its sightings there (sign=vote only).
     """
 
     sign: Literal["winding", "vote", "pseudo_normal"] = "winding"

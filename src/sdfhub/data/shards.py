@@ -66,8 +66,7 @@ def read_record(folder: Path) -> dict | None:
     try:
         record = json.loads((folder / RECORD).read_text())
         whole = all(
-            (folder / f"{name}.npy").stat().st_size == file["bytes"]
-            for name, file in record["files"].items()
+            (folder / f"{name}.npy").stat().st_size == file["bytes"] for name, file in record["files"].items()
         )
     except (OSError, ValueError, KeyError, TypeError):
         return None

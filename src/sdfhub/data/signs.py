@@ -21,6 +21,10 @@ VOTES = 11
 """Neighbours that vote (DeepSDF's code)."""
 VOTERS = 250_000
 """Visible points that stand for election (DeepSDF's code: half of the samples of a shape)."""
+INNER = 0.95
+"""Part of the radius of an empty ball within which its centre's winding number speaks for other points."""
+CLEAR = 0.1
+"""Distance of a winding number from 0 or 1 below which it may speak for others."""
 
 
 @dataclass(frozen=True)
@@ -89,41 +93,38 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
 
     No face crosses the ball around a point whose radius is its distance, so the sign seldom changes within it.
     The number is computed for the centres of such balls only, from large cells to small ones, and handed to the
-    points in the inner part of the ball when it is clearly 0 or 1.
+    other points of the ball when it is clearly 0 or 1 (near a hole it is not).
     """
+    order = morton_order(points)
+    points, distance = points[order], nearest.distance[order]
+    codes, winding, todo = _morton_codes(points), np.empty(len(points)), np.arange(len(points))
     tree = igl.FastWindingNumberBVH()
     tree.init(surface.vertices, surface.solid(), 2)
-    winding = np.empty(len(points))
-    todo = np.arange(len(points))
-    codes = _morton_codes(points)
-    for level in range(9, 1, -1):  # cells of 3/2 down to 3/256 a side
-        cells = codes[todo] >> 3 * level
-        first, row = _largest_in_each(cells, nearest.distance[todo])
-        centre = todo[first]
-        number = tree.winding_number(points[centre])
-        winding[centre] = number
-        clear = np.abs(np.abs(number - 0.5) - 0.5) < CLEAR
-        offset = np.linalg.norm(points[todo] - points[centre][row], axis=1)
-        shared = clear[row] & (offset < INNER * nearest.distance[centre][row])
-        winding[todo[shared]] = number[row[shared]]
-        shared[first] = True
+    for level in range(8, 0, -1):  # cells of 3/4 down to 6/1024 a side
+        if not len(todo):
+            break
+        largest, cell = _largest_of_runs(codes[todo] >> 3 * level, distance[todo])
+        centre = todo[largest]
+        winding[centre] = tree.winding_number(points[centre])
+        speaks = np.abs(np.abs(winding[centre] - 0.5) - 0.5) < CLEAR
+        reach = np.where(speaks, INNER * distance[centre], 0)[cell]
+        shared = np.linalg.norm(points[todo] - points[centre[cell]], axis=1) < reach
+        winding[todo[shared]] = winding[centre[cell[shared]]]
+        shared[largest] = True
         todo = todo[~shared]
     winding[todo] = tree.winding_number(points[todo])
+    winding[order] = winding.copy()
     return Signs(winding > 0.5, np.abs(winding - 0.5) > 0.25)
 
 
-INNER = 0.6
-"""Part of the radius within which a ball's centre speaks for other points."""
-CLEAR = 0.1
-"""Distance of a winding number from 0 or 1 below which its point may speak for others."""
-
-
-def _largest_in_each(cells: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The row of the largest value of each cell, [C], and each row's cell, [N]; `cells` need no order."""
-    _, row = np.unique(cells, return_inverse=True)
-    order = np.lexsort((value, row))
-    last = np.flatnonzero(np.diff(row[order], append=-1))
-    return order[last], row
+def _largest_of_runs(keys: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The row of the largest value in each run of equal keys, [R], and the run of each row, [N]."""
+    starts = np.diff(keys, prepend=-1) != 0
+    run = np.cumsum(starts) - 1
+    rows = np.flatnonzero(value == np.maximum.reduceat(value, np.flatnonzero(starts))[run])
+    largest = np.empty(run[-1] + 1, np.int64)
+    largest[run[rows]] = rows
+    return largest, run
 
 
 def vote_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator) -> Signs:

@@ -50,7 +50,7 @@ def _map_until_crash(function: Callable, items: dict, workers: int) -> Iterator[
     with _pool(workers, function) as pool:
         try:
             with _startable(function):
-                futures = {pool.submit(function, item): index for index, item in items.items()}
+                futures = {pool.submit(_call, item): index for index, item in items.items()}
             for future in as_completed(futures):
                 yield futures[future], future.result()
         finally:
@@ -61,7 +61,7 @@ def _alone(function: Callable, item: object) -> object:
     with _pool(1, function) as pool:
         try:
             with _startable(function):
-                future = pool.submit(function, item)
+                future = pool.submit(_call, item)
             return future.result()
         except BrokenProcessPool:
             return Crashed()
@@ -72,11 +72,21 @@ def _pool(workers: int, function: Callable) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
     if context.get_start_method() == "forkserver":  # imports once what each worker would import
         context.set_forkserver_preload([type(function).__module__])
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_follow_parent)
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(function,))
 
 
-def _follow_parent() -> None:
-    """Ends this worker when its parent is killed: the queue alone would keep it waiting for ever."""
+_function: Callable | None = None
+"""Of a worker process: handed over once, since a source with its list of files may be large."""
+
+
+def _call(item: object) -> object:
+    return _function(item)
+
+
+def _start(function: Callable) -> None:
+    """Sets a worker up, and ends it when its parent is killed: the queue alone would keep it waiting."""
+    global _function
+    _function = function
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (connection.wait([parent.sentinel]), os._exit(1)), daemon=True).start()

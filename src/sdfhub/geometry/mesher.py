@@ -1,15 +1,15 @@
 """From a field to a mesh: marching cubes at the zero level, dense or coarse to fine.
 
-Grid: `resolution` nodes along each axis of the cube [-bound, bound]^3, both end points included: node i lies at
--bound + 2 * bound * i / (resolution - 1). A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2,
-the finest thing that is skipped. Slopes are per grid step, so that no length of the frame enters the decisions.
+Grid: `resolution` nodes along each axis of the cube [-bound, bound]^3, both end points included: node i lies
+at -bound + 2 * bound * i / (resolution - 1). A *cell* of stride s spans s grid steps; a *block* is a cell of
+stride 2, the finest thing that is skipped. Slopes are per grid step: no length of the frame enters.
 
-Coarse to fine: a cell whose centre has the value f cannot hold the surface while |f| > L * half diagonal, where L
-bounds the slope of the field in it. Nothing about a network guarantees an L: those trained with clamped distances
-say only "far" beyond the clamp, and may be steeper than 1 or nearly flat. So L is measured from the samples around
-the cell, multiplied by a safety factor, and never below what the field shows near its surface. What this still
-misses is grown back: wherever a sign change leaves the evaluated blocks, the neighbour is evaluated too. So a
-connected piece of surface is found whole or not at all.
+Coarse to fine: a cell whose centre has the value f cannot hold the surface while |f| > L * half diagonal,
+where L bounds the slope of the field in it. Nothing about a network guarantees an L: those trained with
+clamped distances say only "far" beyond the clamp, and may be steeper than 1 or nearly flat. So L is measured
+from the samples around the cell, multiplied by a safety factor, and never below what the field shows near its
+surface. What this still misses is grown back: wherever a sign change leaves the evaluated blocks, the
+neighbour is evaluated too. So a connected piece of surface is found whole or not at all.
 """
 
 from collections.abc import Callable
@@ -37,30 +37,31 @@ def mesh_field(
     field: Field,
     resolution: int = 256,
     bound: float = 1.0,
-    coarse: int | None = 64,
+    coarse: int | None = 32,
     batch: int = 2**18,
     safety: float = 1.5,
     device: torch.device | str | None = None,
 ) -> Mesh:
     """The zero level of a field as a triangle mesh, evaluated coarse to fine.
 
-    Equals `mesh_dense` except for connected pieces of surface that lie wholly in cells judged empty. Where the
-    surface leaves the cube the mesh is open.
+    Equals `mesh_dense` except for connected pieces of surface that lie wholly in cells judged empty. Where
+    the surface leaves the cube the mesh is open.
 
-    Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with Topological Guarantees, 2003.
+    Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with Topological Guarantees,
+    2003 (the triangles of a cell).
 
     Args:
         field: maps points [N, 3] float32, normalised frame, to signed distances [N], negative inside.
         resolution: grid nodes per axis, >= 2.
         bound: half the edge of the cube, normalised frame.
-        coarse: cells per axis at the coarsest level, about (strides are powers of two); None evaluates every node.
+        coarse: cells per axis at the coarsest level, about: strides are powers of two. None evaluates all.
         batch: points per call of `field`.
         safety: factor on the measured slopes; larger misses less and evaluates more.
         device: where `field` expects its points; by default that of its parameters, else the CPU.
 
     Returns:
-        vertices [V, 3] float64, normalised frame, and faces [F, 3] int64, counter-clockwise seen from outside.
-        Both are empty where the field has no zero crossing.
+        vertices [V, 3] float64, normalised frame, and faces [F, 3] int64, counter-clockwise seen from
+        outside. Both are empty where the field has no zero crossing.
 
     Raises:
         SdfhubError: the field returned values that are not finite.
@@ -108,7 +109,7 @@ def sdf_slice(
         bound, batch, device: as for `mesh_field`.
 
     Returns:
-        [R, R] float32. Of the two axes left, the later one points up (row 0 is +bound), the earlier one right.
+        [R, R] float32. Of the two axes left, the later points up (row 0 is +bound), the earlier right.
     """
     grid = _Grid(field, resolution, bound, batch, _device_of(field, device))
     up, right = np.indices((resolution, resolution)).reshape(2, -1)
@@ -162,7 +163,7 @@ class _Grid:
         values = values.detach().float().cpu().numpy()
         if not np.isfinite(values).all():
             bad = np.count_nonzero(~np.isfinite(values))
-            raise SdfhubError(f"field: {bad} of {len(values)} values are not finite; has its training diverged?")
+            raise SdfhubError(f"field: {bad} of {len(values)} values are not finite; did training diverge?")
         return values
 
     def to_frame(self, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -233,7 +234,7 @@ def _coarse_cells(grid: _Grid, stride: int, safety: float) -> tuple[np.ndarray, 
 def _refine(
     grid: _Grid, cells: np.ndarray, slope: np.ndarray, stride: int, safety: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Those children of active cells, of half their stride, that may hold the surface, and their slope bounds."""
+    """Those children of the cells that may hold the surface, and their slope bounds; `stride` is theirs."""
     children = (2 * cells[:, None] + _CHILDREN).reshape(-1, 3)
     values = grid.evaluate(_centres(children, stride, grid.n))
     siblings = _slope(values.reshape(-1, 2, 2, 2), stride).reshape(-1, 8).max(axis=1, initial=0)
@@ -303,7 +304,7 @@ def _march_slabs(active: np.ndarray, keys: np.ndarray, values: np.ndarray, n: in
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray, period: int) -> Mesh:
-    """One vertex where two slabs hold the same: both computed it from the same values, so it is equal bit by bit."""
+    """One vertex where two slabs hold the same: made from the same values, it is equal bit by bit."""
     seam = np.flatnonzero(vertices[:, 0] % period == 0)
     _, first, place = np.unique(vertices[seam], axis=0, return_index=True, return_inverse=True)
     target = np.arange(len(vertices))

@@ -75,6 +75,6 @@ class MapFit:
             loss = clamped_l1(decoder(points, codes), sdf, self.delta)
             loss = loss + self.lambda_code * codes.square().mean()
             optimizer.zero_grad()
-            (loss * shapes).backward()  # a mean over shapes would shrink each one's gradient
+            (loss * shapes).backward()  # means over shapes would shrink each one's gradient
             optimizer.step()
         return codes.detach()

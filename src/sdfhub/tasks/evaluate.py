@@ -1,10 +1,6 @@
-"""Task `evaluate`: a trained shape space is meshed, judged and shown, known and held-out shapes apart."""
+"""Task `evaluate`: a trained shape space is meshed and judged, known and held-out shapes apart."""
 
-import csv
-import dataclasses
-import io
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,35 +8,28 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.datamodule import Augmentation, StepBatches
+from sdfhub.data.datamodule import Augmentation, StepBatches, wrapping_slice
 from sdfhub.data.shards import StoredShape
+from sdfhub.data.sources import Source
+from sdfhub.data.splits import Split, split
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import mesh_field
-from sdfhub.geometry.metrics import ShapeMetrics, judge, summarize
-from sdfhub.geometry.render import render
+from sdfhub.geometry.metrics import judge
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fitting import MapFit
-from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.prepare import prepare_data
-from sdfhub.tasks.run import load_autodecoder, read_run, write_text
+from sdfhub.tasks.prepare import prepare_split
+from sdfhub.tasks.run import load_autodecoder, read_run
+from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
 
-COLUMNS = {
-    "cd": "CD x10^3",
-    "floor": "floor",
-    "excess": "excess",
-    "normal_consistency": "normals",
-    "f_score": "F-score",
-}
-"""Metrics of the printed table and their headings; the files carry all of them."""
+BATCH = 2**16
+"""Points a call when signed distances are judged; bounds memory, not the result."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +37,12 @@ class Evaluation:
     """How a shape space is judged.
 
     Args:
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side for Chamfer distance and F-score.
-        known: training shapes to judge, from the front of the table; None judges all.
+        resolution: points along an axis of the marching-cubes grid, >= 2.
+        points: surface points a side for Chamfer distance and F-score, >= 1.
+        known: training shapes to judge, from the front of the code table; None judges all.
         held_out: held-out shapes to judge; None judges all.
         fit: how codes of held-out shapes are found.
-        fit_together: held-out shapes fitted side by side.
+        fit_together: held-out shapes fitted side by side, >= 1.
         pictures: shapes of each role on the contact sheet.
         seed: of every draw.
     """
@@ -68,54 +57,53 @@ class Evaluation:
     seed: int = 0
 
     def __post_init__(self):
-        if min(self.resolution, self.points, self.fit_together) < 2 and self.fit_together < 1:
-            raise ValueError("evaluate: resolution and points must be at least 2, fit_together 1")
-
-
-@dataclass(frozen=True)
-class Judged:
-    """One judged shape: who it is, how good it is, and what it looks like in the normalised frame."""
-
-    role: str
-    shape: StoredShape
-    metrics: ShapeMetrics
-    vertices: np.ndarray
-    faces: np.ndarray
+        if self.resolution < 2 or min(self.points, self.fit_together) < 1:
+            raise ValueError("resolution must be at least 2, points and fit_together at least 1")
+        if min(self.known or 0, self.held_out or 0, self.pictures) < 0:
+            raise ValueError("known, held_out and pictures must not be negative")
 
 
 def evaluate_model(
     model: AutoDecoder,
-    train: Sequence[StoredShape],
+    train: Mapping[int, StoredShape],
     held_out: Sequence[StoredShape],
     evaluation: Evaluation,
     out: Path,
 ) -> dict[str, Any]:
-    """Judges known and held-out shapes; writes metrics, meshes and the contact sheet below `out`; prints.
+    """Judges known and held-out shapes; writes what it found below `out` and prints the table.
+
+    Shapes without a mesh (DeepSDF's npz files) are judged by their signed distances alone.
+
+    Args:
+        model: trained.
+        train: shapes that it was trained on, by row of its code table.
+        held_out: shapes that it has not seen.
+        evaluation: how to judge.
+        out: folder of the results.
 
     Returns:
-        What `metrics.json` holds: per role a `summary` and the rows of its `shapes`.
+        What `metrics.json` holds.
     """
-    known, unseen = list(train)[: evaluation.known], list(held_out)[: evaluation.held_out]
     model.eval()
-    with torch.inference_mode():
-        codes = model.codes(torch.arange(len(known), device=model.device))
-    judged = [_judge("known", *pair, model.decoder, evaluation) for pair in _bar(known, codes, "judging known")]
+    known, unseen = list(train.items())[: evaluation.known], list(held_out)[: evaluation.held_out]
+    codes = model.codes.table.detach()
+    roles = [("known", shape, codes[row]) for row, shape in known]
     if unseen:
         codes = fit_held_out(model.decoder, unseen, evaluation)
-        pairs = _bar(unseen, codes, "judging held-out")
-        judged += [_judge("held_out", *pair, model.decoder, evaluation) for pair in pairs]
-    return report(judged, evaluation, out)
+        roles += [("held_out", shape, code) for shape, code in zip(unseen, codes, strict=True)]
+    if any(shape.mesh is None for _, shape, _ in roles):
+        rows = [(role, shape, distance_errors(model.decoder, code, shape)) for role, shape, code in roles]
+        return write_distances(rows, out)
+    bar = tqdm(roles, desc="judging", unit="shape", leave=False)
+    return write_scores([_judge(*row, model.decoder, evaluation) for row in bar], evaluation, out)
 
 
 def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:
     """Codes [S, L] of shapes that were never trained on, from their signed samples."""
     fitted = []
-    groups = range(0, len(shapes), evaluation.fit_together)
-    for start in tqdm(groups, desc="fitting held-out", unit="group", leave=False):
+    for start in range(0, len(shapes), evaluation.fit_together):
         group = list(shapes[start : start + evaluation.fit_together])
-        batches = StepBatches(
-            group, len(group), evaluation.fit.samples, 0, Augmentation(), seed=evaluation.seed
-        )
+        batches = StepBatches(group, len(group), evaluation.fit.samples, 0, Augmentation(), evaluation.seed)
         draw = partial(_in_order, batches)
         fitted.append(evaluation.fit(decoder, draw, len(group), seed=evaluation.seed))
     return torch.cat(fitted)
@@ -128,19 +116,9 @@ def _in_order(batches: StepBatches, step: int) -> tuple[Tensor, Tensor]:
     return batch.points[order], batch.sdf[order]
 
 
-def _bar(shapes: Sequence[StoredShape], codes: Tensor, what: str):
-    return tqdm(list(zip(shapes, codes, strict=True)), desc=what, unit="shape", leave=False)
-
-
 def _judge(role: str, shape: StoredShape, code: Tensor, decoder: Decoder, evaluation: Evaluation) -> Judged:
-    truth = shape.mesh
-    if truth is None:
-        raise SdfhubError(
-            f"{shape.id}: this data source holds no meshes, so there is no surface to compare with; "
-            "train with evaluate=none"
-        )
     vertices, faces = reconstruct(decoder, code, evaluation.resolution)
-    metrics = judge((vertices, faces), truth, points=evaluation.points, seed=evaluation.seed)
+    metrics = judge((vertices, faces), shape.mesh, points=evaluation.points, seed=evaluation.seed)
     return Judged(role, shape, metrics, vertices, faces)
 
 
@@ -155,85 +133,66 @@ def reconstruct(decoder: Decoder, code: Tensor, resolution: int) -> tuple[np.nda
     return mesh_field(lambda x: decoder(x[None], code[None])[0], resolution=resolution, device=code.device)
 
 
-def report(judged: Sequence[Judged], evaluation: Evaluation, out: Path) -> dict[str, Any]:
-    """Writes `metrics.json`, `metrics.csv`, `meshes/` and `contact_sheet.png`; prints the table."""
-    result: dict[str, Any] = {"evaluation": dataclasses.asdict(evaluation)}
-    for role in dict.fromkeys(row.role for row in judged):
-        rows = [row for row in judged if row.role == role]
-        shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
-        result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
-    write_text(out / "metrics.json", json.dumps(result, indent=1))
-    write_text(out / "metrics.csv", _csv(judged))
-    for row in judged:
-        _write_mesh(row, out / "meshes" / row.role / f"{row.shape.id}.ply")
-    _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
-    print(table(judged))
-    print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
-    print(f"metrics:       {out / 'metrics.json'}\nTensorBoard:   tensorboard --logdir {out}")
-    return result
+@torch.inference_mode()
+def distance_errors(decoder: Decoder, code: Tensor, shape: StoredShape, delta: float = 0.1) -> dict[str, float]:
+    """How far the field is from a shape's own samples, up to 100,000 a side.
+
+    Returns:
+        `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units; `sign_accuracy`: share of
+        samples on the right side.
+    """
+    rng = np.random.default_rng(0)
+    sides = [array for array in (shape.outside, shape.inside) if len(array)]
+    drawn = np.concatenate([wrapping_slice(side, min(len(side), 100_000), rng) for side in sides])
+    rows = torch.from_numpy(drawn).to(code.device)
+    field = torch.cat([decoder(part[None, :, :3], code[None])[0] for part in rows.split(BATCH)])
+    near = rows[:, 3].abs() < delta
+    return {
+        "sdf_error": float((field - rows[:, 3]).abs()[near].mean()),
+        "sign_accuracy": float(((field < 0) == (rows[:, 3] < 0)).float().mean()),
+    }
 
 
-def table(judged: Sequence[Judged]) -> str:
-    """The Chamfer table: a line a shape, then mean and median, known and held-out shapes apart."""
-    width = max([len(row.shape.id) for row in judged] + [len("90th percentile")]) + 2
-    lines = []
-    for role in dict.fromkeys(row.role for row in judged):
-        rows = [row for row in judged if row.role == role]
-        title = "known shapes" if role == "known" else "held-out shapes"
-        lines += ["", f"{title:<{width}}" + "".join(f"{heading:>11}" for heading in COLUMNS.values())]
-        lines += [f"{row.shape.id:<{width}}{_cells(row.metrics)}" for row in rows]
-        whole = [row.metrics for row in rows if not row.metrics.failed]
-        statistics = {"mean": np.mean, "median": np.median, "90th percentile": partial(np.quantile, q=0.9)}
-        for name, statistic in statistics.items() if whole else ():
-            values = {key: float(statistic([getattr(m, key) for m in whole])) for key in COLUMNS}
-            lines.append(f"{name:<{width}}" + "".join(_number(key, values[key]) for key in COLUMNS))
-        lines.append(f"{'without surface':<{width}}{len(rows) - len(whole):>11} of {len(rows)}")
-    return "\n".join(lines)
+def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
+    """Judges a finished run again, as `config` says, into `out` or a folder `evaluation` of the run."""
+    run = Path(check(config["run"], str, "run"))
+    out = check(config["out"], str | None, "out")
+    evaluation = build(config["evaluate"], "evaluate")
+    trained, roles_then = read_run(run)
+    model = load_autodecoder(run, trained)
+    data = trained["data"] | config["data"]
+    source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    is_trained_on = data["source"] == trained["data"]["source"]
+    roles = choose_shapes(source, roles_then if is_trained_on else {"train": [], "held_out": []}, config)
+    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
+    prepared = prepare_split(source, roles, preparation, data)
+    known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
+    return evaluate_model(model, known, prepared.held_out, evaluation, Path(out) if out else run / "evaluation")
 
 
-def _cells(metrics: ShapeMetrics) -> str:
-    if metrics.failed:
-        return f"{'no surface':>11}"
-    return "".join(_number(key, getattr(metrics, key)) for key in COLUMNS)
+def choose_shapes(source: Source, trained: dict[str, list[str]], config: dict[str, Any]) -> Split:
+    """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
 
+    A shape that was trained on is never judged as an unseen one.
 
-def _number(key: str, value: float) -> str:
-    thousandfold = key in ("cd", "floor", "excess")
-    return f"{value * 1e3 if thousandfold else value:>11.4f}"
-
-
-def _csv(judged: Sequence[Judged]) -> str:
-    fields = [field.name for field in dataclasses.fields(ShapeMetrics)]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["role", "id", *fields])
-    for row in judged:
-        writer.writerow([row.role, row.shape.id, *(getattr(row.metrics, field) for field in fields)])
-    return text.getvalue()
-
-
-def _write_mesh(row: Judged, path: Path) -> None:
-    """The reconstruction as PLY, back in its source's frame; nothing where there is no surface."""
-    if not len(row.faces):
-        return
-    vertices = row.vertices / row.shape.scale + row.shape.center
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".part.ply")
-    trimesh.Trimesh(vertices, row.faces, process=False).export(beside)
-    beside.replace(path)
-
-
-def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
-    """Ground truth above reconstruction, known shapes first."""
-    shown = [row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]]
-    truth = [_picture(row.shape.mesh) for row in shown]
-    ours = [render(row.vertices, row.faces) if len(row.faces) else None for row in shown]
-    captions = [f"{row.shape.id} ({row.role.replace('_', ' ')})" for row in shown]
-    contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
-
-
-def _picture(mesh: NormalizedMesh) -> np.ndarray:
-    return render(mesh.vertices, mesh.faces)
+    Raises:
+        SdfhubError: a shape that the source does not have.
+    """
+    offered = {shape.id: shape for shape in source.shapes()}
+    ids = check(config["shapes"], list[str] | None, "shapes")
+    count = check(config["held_out"], int | None, "held_out")
+    unseen = [id for id in offered if id not in set(trained["train"])]
+    known = trained["train"]
+    if ids is not None:
+        known, unseen = [id for id in ids if id in known], [id for id in ids if id not in known]
+    elif trained["train"] and count is None:
+        unseen = trained["held_out"]
+    elif count is not None:
+        unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).test]
+    for id in (*known, *unseen):
+        if id not in offered:
+            raise SdfhubError(f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ...")
+    return Split([offered[id] for id in known], [offered[id] for id in unseen])
 
 
 def main() -> None:
@@ -243,16 +202,3 @@ def main() -> None:
         evaluate_run(plain(config))
 
     run_task(task, "evaluate")
-
-
-def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
-    """Judges a finished run again, as `config` says, into `RUN/evaluation` or `out`."""
-    run = Path(check(config["run"], str, "run"))
-    trained, split = read_run(run)
-    evaluation = build(config["evaluate"], "evaluate")
-    prepared = prepare_data(trained["data"] | config["data"])
-    known = [prepared.store[id] for id in split["train"]]
-    unseen = [shape for shape in prepared.held_out if shape.id not in set(split["train"])]
-    augmentation = trained["data"]["loader"]["augmentation"]
-    model = load_autodecoder(run, trained, rows=len(known) * (1 + augmentation["copies"]))
-    return evaluate_model(model, known, unseen, evaluation, Path(config["out"] or run / "evaluation"))

@@ -70,7 +70,7 @@ def build_autodecoder(config: dict[str, Any], rows: int) -> AutoDecoder:
     )
 
 
-def load_autodecoder(run: Path, config: dict[str, Any], rows: int) -> AutoDecoder:
+def load_autodecoder(run: Path, config: dict[str, Any]) -> AutoDecoder:
     """The trained model of a run, on the CPU, in evaluation mode. Runs no code of the checkpoint.
 
     Raises:
@@ -83,10 +83,10 @@ def load_autodecoder(run: Path, config: dict[str, Any], rows: int) -> AutoDecode
         raise SdfhubError(f"{path}: there is no checkpoint; has the run trained to the end?") from error
     except Exception as error:  # torch names a dozen kinds of damage
         raise SdfhubError(f"{path}: not a readable checkpoint: {str(error).splitlines()[0]}") from error
-    model = build_autodecoder(config, rows)
     try:
+        model = build_autodecoder(config, rows=len(state["codes.table"]))
         model.load_state_dict(state)
-    except RuntimeError as error:
+    except (RuntimeError, KeyError, TypeError) as error:
         detail = str(error).splitlines()[-1].strip()
         raise SdfhubError(f"{path}: does not fit the model of config.yaml: {detail}") from error
     return model.eval()

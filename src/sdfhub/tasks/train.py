@@ -35,9 +35,6 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     loader = make_loader(shapes=prepared.train)
     model = build_autodecoder(config, loader.rows)
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
-    for callback in callbacks.values():
-        if hasattr(callback, "truth"):
-            callback.truth = prepared.train
     trainer = make_trainer(
         default_root_dir=run,
         logger=TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
@@ -45,7 +42,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     )
     print(f"run: {run}")
     trainer.fit(model, datamodule=loader, ckpt_path=checkpoint, weights_only=True)
-    return evaluate_model(model, prepared.train, prepared.held_out, evaluation, run, trainer.logger)
+    return evaluate_model(model, dict(enumerate(prepared.train)), prepared.held_out, evaluation, run)
 
 
 def _checkpointing(run: Path) -> ModelCheckpoint:

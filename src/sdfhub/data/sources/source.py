@@ -1,9 +1,12 @@
 """What every data source offers: a list of shapes, and the mesh or the samples of one of them."""
 
+import hashlib
 import re
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -90,3 +93,24 @@ def folder_safe(text: str) -> str:
     """`text` with everything that a shape's id may not hold replaced by `_`."""
     safe = re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).lstrip("._+-")
     return safe[:100] or "unnamed"
+
+
+def unique_ids(wanted: Mapping[Path, str]) -> dict[str, Path]:
+    """Path of each id; paths that want the same id get some digits of their hash behind it."""
+    uses = Counter(wanted.values())
+    return {id if uses[id] == 1 else f"{id}-{_digits(path)}": path for path, id in sorted(wanted.items())}
+
+
+def _digits(path: Path) -> str:
+    return hashlib.sha256(path.as_posix().encode()).hexdigest()[:6]
+
+
+def name_of_root(kind: str, root: Path) -> str:
+    """A source's name that tells two roots apart, such as `folder-scans-1a2b3c`."""
+    return f"{kind}-{folder_safe(root.resolve().name)}-{_digits(root.resolve())}"
+
+
+def state_of(file: Path) -> str:
+    """A fingerprint from a file's size and date, for trees too large to be read at every start."""
+    state = file.stat()
+    return f"{state.st_size} {state.st_mtime_ns}"

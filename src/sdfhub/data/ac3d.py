@@ -1,0 +1,152 @@
+"""AC3D, the text format of FlightGear's aircraft: a tree of polygon objects.
+
+Source: AC3D file format specification (inivis).
+"""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from sdfhub.errors import RejectedMesh
+
+MAX_DEPTH = 100
+POLYGON, STRIP = 0, 4
+"""Surface types with an area (the low four bits of `SURF`); 1 and 2 are closed and open lines."""
+
+
+def read_ac3d(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] float64 and triangles [F, 3] int64 of an AC3D file, all objects in the world's frame.
+
+    Polygons become fans, lines are skipped.
+
+    Raises:
+        RejectedMesh: corrupt_file; no AC3D file, or one that ends too early.
+    """
+    if not content.startswith(b"AC3D"):
+        raise RejectedMesh("corrupt_file", "does not start with AC3D")
+    reader = _Reader(content)
+    triangles = _Triangles()
+    try:
+        while (line := reader.next_line()) is not None:
+            if line[:1] == ["OBJECT"]:
+                _read_object(reader, triangles, np.eye(3), np.zeros(3), 0)
+    except (ValueError, IndexError, OverflowError) as error:
+        raise RejectedMesh("corrupt_file", f"byte {reader.position}: {error}") from error
+    return triangles.arrays()
+
+
+@dataclass
+class _Reader:
+    """Lines of the file as lists of words, and the payloads between them."""
+
+    content: bytes
+    position: int = 0
+
+    def next_line(self) -> list[str] | None:
+        """The words of the next line that is not blank, or None at the end."""
+        while self.position < len(self.content):
+            end = self.content.find(b"\n", self.position)
+            end = len(self.content) if end < 0 else end
+            words = self.content[self.position : end].decode("latin-1").split()
+            self.position = end + 1
+            if words:
+                return words
+        return None
+
+    def line(self) -> list[str]:
+        """The words of a line that must be there."""
+        words = self.next_line()
+        if words is None:
+            raise ValueError("the file ends in the middle of an object")
+        return words
+
+    def rows(self, count: int, columns: int) -> np.ndarray:
+        """[count, columns] numbers, one row a line; what follows on a line is left out."""
+        if not 0 <= count <= len(self.content):
+            raise ValueError(f"{count} rows cannot be in this file")
+        rows = [self.line()[:columns] for _ in range(count)]
+        return np.array(rows, dtype=np.float64).reshape(count, columns)
+
+    def skip(self, count: int) -> None:
+        if not 0 <= count <= len(self.content) - self.position:
+            raise ValueError(f"a payload of {count} bytes cannot be in this file")
+        self.position += count + 1  # and the end of its line
+
+
+@dataclass
+class _Triangles:
+    vertices: list[np.ndarray] = field(default_factory=list)
+    faces: list[tuple[int, int, int]] = field(default_factory=list)
+    count: int = 0
+
+    def add_vertices(self, vertices: np.ndarray) -> int:
+        """Adds [V, 3] vertices; returns the index of the first."""
+        first = self.count
+        self.vertices.append(vertices)
+        self.count += len(vertices)
+        return first
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        vertices = np.concatenate([np.zeros((0, 3)), *self.vertices])
+        return vertices, np.array(self.faces, dtype=np.int64).reshape(-1, 3)
+
+
+def _read_object(
+    reader: _Reader, triangles: _Triangles, rotation: np.ndarray, origin: np.ndarray, depth: int
+) -> None:
+    """Reads one object and its kids, up to and with the last kid.
+
+    Args:
+        rotation: [3, 3] of the parent; rows of points are multiplied from the left.
+        origin: [3], the parent's origin in the world.
+    """
+    if depth > MAX_DEPTH:
+        raise ValueError(f"objects are nested more than {MAX_DEPTH} deep")
+    own_rotation, location, vertices, surfaces = np.eye(3), np.zeros(3), np.zeros((0, 3)), []
+    while True:
+        words = reader.line()
+        match words[:1]:
+            case ["rot"]:
+                own_rotation = np.array(words[1:10], dtype=np.float64).reshape(3, 3)
+            case ["loc"]:
+                location = np.array(words[1:4], dtype=np.float64).reshape(3)
+            case ["data"]:
+                reader.skip(int(words[1]))
+            case ["numvert"]:
+                vertices = reader.rows(int(words[1]), 3)
+            case ["numsurf"]:
+                surfaces = [face for _ in range(int(words[1])) for face in _read_surface(reader)]
+            case ["kids"]:
+                kids = int(words[1])
+                break
+    origin = location @ rotation + origin
+    rotation = own_rotation @ rotation
+    if any(not 0 <= corner < len(vertices) for face in surfaces for corner in face):
+        raise ValueError("a surface has a vertex that is not there")
+    first = triangles.add_vertices(vertices @ rotation + origin)
+    triangles.faces += [(a + first, b + first, c + first) for a, b, c in surfaces]
+    for _ in range(kids):
+        while (words := reader.next_line()) is not None and words[:1] != ["OBJECT"]:
+            pass
+        if words is None:
+            return  # many files announce more kids than they hold
+        _read_object(reader, triangles, rotation, origin, depth + 1)
+
+
+def _read_surface(reader: _Reader) -> list[tuple[int, int, int]]:
+    """The triangles of one surface; none for a line."""
+    kind, words = POLYGON, reader.line()
+    while words[:1] != ["refs"]:
+        if words[:1] == ["SURF"]:
+            kind = int(words[1], 16) & 15
+        elif words[:1] != ["mat"]:
+            raise ValueError(f"{words[0]!r} instead of a surface's refs")
+        words = reader.line()
+    corners = [int(reader.line()[0]) for _ in range(int(words[1]))]
+    if kind == POLYGON:
+        return [(corners[0], b, c) for b, c in pairwise(corners[1:])]
+    if kind == STRIP:
+        triples = zip(corners, corners[1:], corners[2:], strict=False)
+        return [(a, b, c) if i % 2 == 0 else (b, a, c) for i, (a, b, c) in enumerate(triples)]
+    return []

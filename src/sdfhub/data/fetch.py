@@ -1,0 +1,169 @@
+"""Fetches the open meshes: `python -m sdfhub.data.fetch [--root data/open]`.
+
+On Debian and Ubuntu apt-get downloads the two packages, without root and without installing them. Elsewhere
+put the two .deb files, or the folders unpacked from them, into the root by hand and run this again.
+"""
+
+import argparse
+import io
+import lzma
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
+
+from sdfhub.errors import SdfhubError
+
+PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
+"""Debian packages and the suffix of the meshes in them; nothing else of them is unpacked."""
+
+MAX_MEMBER = 256 << 20
+MAX_TOTAL = 2 << 30
+
+
+def fetch(root: str | Path) -> None:
+    """Puts the meshes of both packages below `root`; what is there already stays.
+
+    Raises:
+        SdfhubError: a package is neither there nor can be downloaded; says which files to put where.
+    """
+    root = Path(root)
+    root.mkdir(parents=True, exist_ok=True)
+    for leftover in root.glob(".fetch-*"):  # of a run that was killed
+        shutil.rmtree(leftover, ignore_errors=True)
+    missing = [package for package, suffix in PACKAGES.items() if not any(root.rglob(f"*{suffix}"))]
+    for package in missing:
+        with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
+            archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
+            unpacked = Path(scratch) / "unpacked"
+            count = unpack(archive, unpacked, PACKAGES[package])
+            os.rename(unpacked, root / package)
+            print(f"{package}: {count} files in {root / package}")
+    if not missing:
+        print(f"{root}: both packages are there")
+
+
+def unpack(archive: Path, folder: Path, suffix: str) -> int:
+    """Unpacks a .deb's regular files that end in `suffix`, and its copyright file; returns their number.
+
+    Raises:
+        SdfhubError: not a whole .deb, or one that holds no such file or unreasonably large ones.
+    """
+    count, total = 0, 0
+    try:
+        with _data_tar(archive) as stream, tarfile.open(fileobj=stream, mode="r|") as tar:
+            for member in tar:
+                if not _is_wanted(member, suffix):
+                    continue
+                total += member.size
+                if member.size > MAX_MEMBER or total > MAX_TOTAL:
+                    raise SdfhubError(f"{archive}: {member.name} is larger than anything expected of it")
+                target = folder.joinpath(*PurePosixPath(member.name).parts)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("wb") as file:
+                    shutil.copyfileobj(tar.extractfile(member), file)
+                count += 1
+    except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
+        what = f"{archive}: not a whole .deb ({error}); delete it and download it again"
+        raise SdfhubError(what) from error
+    if not count:
+        raise SdfhubError(f"{archive}: holds no {suffix} files; is it the right package?")
+    return count
+
+
+def _is_wanted(member: tarfile.TarInfo, suffix: str) -> bool:
+    path = PurePosixPath(member.name)
+    is_inside = not path.is_absolute() and ".." not in path.parts
+    is_ours = path.suffix.lower() == suffix or path.name == "copyright"
+    return member.isreg() and is_inside and is_ours
+
+
+@contextmanager
+def _data_tar(archive: Path) -> Iterator[BinaryIO]:
+    """The uncompressed data.tar of a .deb as a stream."""
+    if shutil.which("dpkg-deb"):  # knows every compression that Debian and Ubuntu use
+        command = ["dpkg-deb", "--fsys-tarfile", str(archive)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+            yield process.stdout
+            shutil.copyfileobj(process.stdout, io.BytesIO())  # the padding after the last member
+        if process.returncode:
+            raise ValueError(f"dpkg-deb ended with status {process.returncode}")
+        return
+    with archive.open("rb") as file:
+        name = _seek_data_member(file)
+        if not name.endswith(".xz"):
+            raise SdfhubError(f"{archive}: {name} needs dpkg-deb; take Debian's package, not Ubuntu's")
+        with lzma.open(file) as stream:
+            yield stream
+
+
+def _seek_data_member(file: BinaryIO) -> str:
+    """Moves to the content of the `data.tar...` member of an ar archive, its last; returns its name."""
+    if file.read(8) != b"!<arch>\n":
+        raise ValueError("no ar archive")
+    while len(header := file.read(60)) == 60 and header[58:] == b"`\n":
+        name = header[:16].decode("ascii", "replace").strip().rstrip("/")
+        if name.startswith("data.tar"):
+            return name
+        size = int(header[48:58])
+        file.seek(size + size % 2, os.SEEK_CUR)
+    raise ValueError("no data.tar in it")
+
+
+def _archive_by_hand(root: Path, package: str) -> Path | None:
+    return next(iter(sorted(root.glob(f"{package}*.deb"), reverse=True)), None)
+
+
+def _download(package: str, scratch: Path, root: Path) -> Path:
+    """Downloads a package by apt-get into `scratch`, with package lists of our own where there are none."""
+    if not shutil.which("apt-get"):
+        raise SdfhubError(_by_hand(package, root, "this is no Debian or Ubuntu"))
+    if _apt(scratch, "download", package):
+        (scratch / "lists" / "partial").mkdir(parents=True)
+        private = ["-o", f"Dir::State::Lists={scratch / 'lists'}", "-o", f"Dir::Cache={scratch}"]
+        problem = _apt(scratch, *private, "update") or _apt(scratch, *private, "download", package)
+        if problem:
+            raise SdfhubError(_by_hand(package, root, f"apt-get: {problem}"))
+    return _archive_by_hand(scratch, package)
+
+
+def _apt(folder: Path, *arguments: str) -> str:
+    """Runs apt-get in `folder`; returns the last line of its complaint, empty when all went well."""
+    # apt hands downloads to a user of its own, who may not enter our folder
+    command = ["apt-get", "-q", "-o", "APT::Sandbox::User=", *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("E:")] or done.stderr.splitlines()
+    is_there = "download" not in arguments or _archive_by_hand(folder, arguments[-1])
+    if done.returncode == 0 and is_there:
+        return ""
+    return lines[-1] if lines else f"status {done.returncode}"
+
+
+def _by_hand(package: str, root: Path, why: str) -> str:
+    wanted = " and ".join(f"{name}_*_all.deb" for name in PACKAGES)
+    return (
+        f"{package} is not in {root} and cannot be downloaded ({why}); "
+        f"get {wanted} from Debian's package pages, put them into {root} and run this again"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m sdfhub.data.fetch", description=fetch.__doc__)
+    parser.add_argument("--root", default="data/open", help="where the meshes go (default: %(default)s)")
+    try:
+        fetch(parser.parse_args(arguments).root)
+    except (SdfhubError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

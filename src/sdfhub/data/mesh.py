@@ -1,0 +1,128 @@
+"""Mesh files of the usual formats, read as bare triangles: no materials, no merging, no repair."""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from sdfhub.data.ac3d import read_ac3d
+from sdfhub.errors import RejectedMesh, SdfhubError
+
+FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
+MAX_BYTES = 1 << 30
+"""A larger file is refused before it is read: text formats take some ten times their size in memory."""
+
+_BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
+
+
+def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] float64 and triangles [F, 3] int64 of a mesh file, in the file's frame and units.
+
+    The parts of a scene are put together under their transforms; polygons become triangles. Vertices are
+    neither merged nor dropped.
+
+    Raises:
+        SdfhubError: the file is missing, too large or of no known format.
+        RejectedMesh: empty_file, corrupt_file, no_faces or non_finite_vertices; the detail names the file.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise SdfhubError(f"{path}: not a mesh format known here ({' '.join(FORMATS)})")
+    if not path.is_file():
+        raise SdfhubError(f"{path}: no such file")
+    if path.stat().st_size > MAX_BYTES:
+        raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; decimate the mesh first")
+    return triangles_of(path.read_bytes(), path.suffix.lower(), str(path), path.parent)
+
+
+def triangles_of(
+    content: bytes, suffix: str, name: str, folder: Path | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The triangles of a mesh file's content; see `read_mesh`.
+
+    Args:
+        content: the whole file.
+        suffix: one of FORMATS.
+        name: what messages call it.
+        folder: where a .gltf finds its buffers; None forbids other files.
+    """
+    if not content.strip():
+        raise RejectedMesh("empty_file", f"{name} holds nothing")
+    if suffix == ".obj" and (bad := _BAD_NUMBER.search(content)):
+        line = bad[0].strip().decode(errors="replace")
+        raise RejectedMesh("non_finite_vertices", f"{name} has the line {line!r}")
+    try:
+        vertices, faces = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
+    except RejectedMesh as rejection:
+        raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
+    except Exception as error:  # trimesh raises whatever the broken bytes lead to
+        what = f"{name} cannot be read as {suffix[1:]} ({type(error).__name__}: {error})"
+        raise RejectedMesh("corrupt_file", what) from error
+    _check_triangles(vertices, faces, name)
+    return vertices, faces
+
+
+def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    options = {}
+    if suffix in (".obj", ".off"):
+        content = _utf8(content)
+    if suffix in (".obj", ".glb", ".gltf"):
+        options["skip_materials"] = True
+    files = _Beside(folder if suffix == ".gltf" else None)
+    with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused below
+        mesh = trimesh.load_mesh(
+            io.BytesIO(content), file_type=suffix[1:], process=False, resolver=files, **options
+        )
+    return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+
+
+def _utf8(content: bytes) -> bytes:
+    """Text in any encoding as UTF-8: names and comments may be in another, numbers are the same in all."""
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return content.decode("latin-1").encode()
+    return content
+
+
+def _check_triangles(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
+    if not faces.size:
+        raise RejectedMesh("no_faces", f"{name} holds no faces; point clouds have no inside")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RejectedMesh("corrupt_file", f"{name} has a face with a vertex that is not there")
+    if not np.isfinite(vertices).all():
+        count = int((~np.isfinite(vertices)).any(axis=1).sum())
+        raise RejectedMesh("non_finite_vertices", f"{name} has {count} vertices that are not finite")
+
+
+class _Beside(trimesh.resolvers.Resolver):
+    """Gives a .gltf the buffers that lie below its own folder and nothing else: its paths are not trusted."""
+
+    def __init__(self, folder: Path | None):
+        self.folder = folder
+
+    def get(self, name: str) -> bytes:
+        path = buffer_path(self.folder, name)
+        if path is None:
+            raise FileNotFoundError(f"its buffer {name!r} does not lie beside it")
+        return path.read_bytes()
+
+    def keys(self):
+        return []
+
+    def write(self, name, data):
+        raise PermissionError("meshes are only read")
+
+    def namespaced(self, namespace):
+        return self
+
+
+def buffer_path(folder: Path | None, name: str) -> Path | None:
+    """Where a file that a .gltf names lies, or None where it is not below `folder` or too large."""
+    if folder is None:
+        return None
+    path = (folder / name).resolve()
+    is_below = path.is_relative_to(folder.resolve()) and path.is_file()
+    return path if is_below and path.stat().st_size <= MAX_BYTES else None

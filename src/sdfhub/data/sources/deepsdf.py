@@ -1,0 +1,140 @@
+"""Samples that DeepSDF's own preprocessing wrote: no meshes needed."""
+
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sdfhub.data.sources.source import (
+    Shape,
+    Source,
+    folder_safe,
+    name_of_root,
+    plain_categories,
+    state_of,
+    unique_ids,
+)
+from sdfhub.data.sources.split_file import with_roles
+from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.shapes import ShapeSamples
+
+MAX_BYTES = 1 << 30
+"""Of one array; DeepSDF's have some 8 MB."""
+
+_SAMPLES, _PARAMETERS = "SdfSamples", "NormalizationParameters"
+
+
+class DeepSdfSource(Source):
+    """Every .npz with `pos` and `neg` ([n, 4] rows x, y, z, sdf) below a folder.
+
+    DeepSDF writes `SdfSamples/<dataset>/<class>/<id>.npz`; any tree will do. Where classes are named by a
+    synset of `categories`, only those categories are taken; otherwise all files are, and a file's folder
+    names its category. The files lie in the normalised frame and carry no surface normals and no mesh;
+    `NormalizationParameters/...` beside `SdfSamples` gives the way back to the source's frame.
+
+    Args:
+        root: the folder, searched with all below it.
+        categories: name -> {synset}, or None.
+        train_split: file listing the training shapes, DeepSDF's form; see `split_file.with_roles`.
+        test_split: the same for held-out shapes. Where either is given, unlisted shapes are left out.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        categories: Mapping | None = None,
+        train_split: str | None = None,
+        test_split: str | None = None,
+    ):
+        self.root = Path(root)
+        settings = plain_categories(categories) if categories else {}
+        self.category_of = {each["synset"]: name for name, each in settings.items() if each.get("synset")}
+        self.train_split, self.test_split = train_split, test_split
+        self.name = name_of_root("deepsdf", self.root)
+        self._files: dict[str, Path] = {}
+
+    def shapes(self) -> list[Shape]:
+        if not self.root.is_dir():
+            raise SdfhubError(f"data.source.root={self.root}: no such folder")
+        files = [file for file in sorted(self.root.rglob("*.npz")) if _PARAMETERS not in file.parts]
+        if not files:
+            raise SdfhubError(f"data.source.root={self.root}: holds no .npz files with DeepSDF's samples")
+        is_by_synset = any(file.parent.name in self.category_of for file in files)
+        files = [file for file in files if not is_by_synset or file.parent.name in self.category_of]
+        self._files = unique_ids({file: self._id(file) for file in files})
+        found = [
+            (Shape(id, id.partition("/")[0], state_of(file)), self._path(file))
+            for id, file in sorted(self._files.items())
+        ]
+        return with_roles(found, self.train_split, self.test_split)
+
+    def load(self, shape: Shape) -> ShapeSamples:
+        if not self._files:
+            self.shapes()
+        return read_samples(self._files[shape.id])
+
+    def _path(self, file: Path) -> str:
+        return file.relative_to(self.root).with_suffix("").as_posix()
+
+    def _id(self, file: Path) -> str:
+        parents = self._path(file).split("/")[:-1]
+        folder = "_".join(part for part in parents if part != _SAMPLES) or "folder"
+        return f"{folder_safe(self.category_of.get(file.parent.name, folder))}/{folder_safe(file.stem)}"
+
+
+def read_samples(path: Path) -> ShapeSamples:
+    """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does.
+
+    Raises:
+        RejectedMesh: corrupt_file, or one_sided_samples where nothing lies outside or nothing inside.
+    """
+    positive, negative = _rows(path, "pos"), _rows(path, "neg")
+    if not len(positive) or not len(negative):
+        what = f"{path}: {len(positive)} samples outside, {len(negative)} inside"
+        raise RejectedMesh("one_sided_samples", what)
+    rows = np.concatenate([positive, negative])
+    center, scale = _frame(path)
+    none = np.zeros((0, 3), dtype=np.float32)
+    statistics = {"inside": len(negative) / len(rows)}
+    return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, center, scale, None, statistics)
+
+
+def _rows(path: Path, name: str) -> np.ndarray:
+    rows = _array(path, name)
+    if rows.ndim != 2 or rows.shape[1] != 4:
+        raise RejectedMesh("corrupt_file", f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]")
+    rows = rows.astype(np.float32)
+    return rows[np.isfinite(rows).all(axis=1)]
+
+
+def _frame(path: Path) -> tuple[np.ndarray, float]:
+    """Centre and scale of the source, from DeepSDF's `normalised = (source + offset) * scale`."""
+    parts = [_PARAMETERS if part == _SAMPLES else part for part in path.parts]
+    beside = Path(*parts)
+    if _SAMPLES not in path.parts or not beside.is_file():
+        return np.zeros(3), 1.0
+    offset, scale = _array(beside, "offset").ravel(), _array(beside, "scale").ravel()
+    is_finite = bool(np.isfinite([*offset, *scale]).all())
+    if offset.shape != (3,) or scale.shape != (1,) or not is_finite or scale[0] <= 0:
+        raise RejectedMesh("corrupt_file", f"{beside}: no offset [3] and positive scale")
+    return -offset.astype(np.float64), float(scale[0])
+
+
+def _array(path: Path, name: str) -> np.ndarray:
+    """One floating-point array of an .npz, its size checked before anything is allocated."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = {(1, 0): np.lib.format.read_array_header_1_0}.get(
+                version, np.lib.format.read_array_header_2_0
+            )
+            shape, is_fortran, dtype = read_header(file)
+            size = math.prod(shape) * dtype.itemsize
+            if dtype.kind != "f" or size > MAX_BYTES:
+                raise ValueError(f"{name} is {list(shape)} {dtype}, not some floating-point numbers")
+            content = file.read(size)
+            return np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
+    except (OSError, KeyError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise RejectedMesh("corrupt_file", f"{path}: {error}") from error

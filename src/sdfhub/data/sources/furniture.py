@@ -1,0 +1,95 @@
+"""Sweet Home 3D furniture libraries (.sh3f): zip archives of OBJ models with a catalogue of their names."""
+
+import re
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from sdfhub.errors import RejectedMesh, SdfhubError
+
+CATALOGUE = "PluginFurnitureCatalog.properties"
+MAX_CATALOGUE = 16 << 20
+MAX_MODEL = 256 << 20
+"""Of one uncompressed model: what a small archive may claim to unpack to."""
+
+
+@dataclass(frozen=True)
+class Furniture:
+    """One entry of a catalogue whose model is an OBJ file.
+
+    Args:
+        archive: the .sh3f file.
+        member: the model's name within it.
+        title: as the catalogue names it.
+        credits: author, licence and title.
+    """
+
+    archive: Path
+    member: str
+    title: str
+    credits: dict[str, str]
+
+
+def furniture_in(archive: Path) -> Iterator[Furniture]:
+    """The entries of a library in the catalogue's order.
+
+    Raises:
+        SdfhubError: not a zip archive with a catalogue.
+    """
+    try:
+        with zipfile.ZipFile(archive) as library:
+            entries = parse_properties(_content(library, CATALOGUE, MAX_CATALOGUE).decode("latin-1"))
+            members = set(library.namelist())
+    except (OSError, KeyError, RejectedMesh, zipfile.BadZipFile) as error:
+        raise SdfhubError(f"{archive}: not a furniture library ({error}); fetch it again") from error
+    numbers = sorted(int(key[5:]) for key in entries if re.fullmatch(r"name#\d{1,9}", key))
+    for number in numbers:
+        entry = {key: entries.get(f"{key}#{number}", "") for key in ("name", "model", "creator", "license")}
+        member = next((m for m in _member_names(entry["model"]) if m in members), None)
+        if member and member.lower().endswith(".obj"):
+            licence = entry["license"] or entries.get("license", "")
+            credits = {"author": entry["creator"], "licence": licence, "title": entry["name"]}
+            yield Furniture(archive, member, entry["name"], credits)
+
+
+def read_model(archive: Path, member: str) -> bytes:
+    """The content of a model within its library.
+
+    Raises:
+        RejectedMesh: corrupt_file; the archive is damaged there, or the model larger than MAX_MODEL.
+    """
+    try:
+        with zipfile.ZipFile(archive) as library:
+            return _content(library, member, MAX_MODEL)
+    except (OSError, KeyError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise RejectedMesh("corrupt_file", f"{archive}: {member}: {error}") from error
+
+
+def parse_properties(text: str) -> dict[str, str]:
+    r"""Keys and values of a Java properties file: comments, `\` at a line's end, and `\uXXXX` are known."""
+    joined = re.sub(r"\\\r?\n[ \t]*", "", text)
+    pairs = re.findall(r"^[ \t]*([^#!\s=:][^\s=:]*)[ \t]*[=:][ \t]*(.*?)[ \t\r]*$", joined, re.MULTILINE)
+    return {key: _unescaped(value) for key, value in pairs}
+
+
+def _unescaped(value: str) -> str:
+    letters = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), value)
+    return re.sub(r"\\(.)", r"\1", letters).strip()
+
+
+def _member_names(model: str) -> Iterator[str]:
+    """The names under which an archive may hold a model; none that leads out of it."""
+    for name in (model, unquote(model)):
+        path = PurePosixPath(name.lstrip("/"))
+        if name and ".." not in path.parts:
+            yield str(path)
+
+
+def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:
+    with library.open(member) as file:
+        content = file.read(limit + 1)  # what its header says of its size is not to be trusted
+    if len(content) > limit:
+        raise RejectedMesh("corrupt_file", f"{member} unpacks to more than {limit >> 20} MiB")
+    return content

@@ -1,0 +1,78 @@
+"""Split files: which shapes somebody else trained and tested on."""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from sdfhub.data.sources.source import Shape
+from sdfhub.errors import SdfhubError
+
+
+def with_roles(
+    shapes: list[tuple[Shape, str]], train_split: str | None, test_split: str | None
+) -> list[Shape]:
+    """The shapes that split files list, with their roles; all of them, without roles, where no file is given.
+
+    A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
+    of names, or `{"train": [names], "test": [names]}`, which may be given for both sides. A name is the path
+    of a shape's file, or its last parts, without the suffix.
+
+    Args:
+        shapes: each with its path below the source's root, without suffix.
+        train_split: file that lists the training shapes, or None.
+        test_split: file that lists the held-out shapes, or None.
+
+    Raises:
+        SdfhubError: a file is missing or of another form, lists nothing that is there, or both list a shape.
+    """
+    if not train_split and not test_split:
+        return [shape for shape, _ in shapes]
+    role_of: dict[str, str] = {}
+    for role, file in (("train", train_split), ("test", test_split)):
+        listed = _ids_listed(shapes, file, role) if file else []
+        both = next((id for id in listed if id in role_of), None)
+        if both:
+            raise SdfhubError(f"{file}: {both} is in the training split as well")
+        role_of |= dict.fromkeys(listed, role)
+    return [replace(shape, split=role_of[shape.id]) for shape, _ in shapes if shape.id in role_of]
+
+
+def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[str]:
+    names = set(_names(file, role))
+    endings = {ending for name in names for ending in _endings(name)}
+    listed = [shape.id for shape, path in shapes if path in endings or not names.isdisjoint(_endings(path))]
+    if not listed:
+        raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
+    return listed
+
+
+def _names(file: str, role: str) -> Iterator[str]:
+    try:
+        content = json.loads(Path(file).read_text())
+    except OSError as error:
+        raise SdfhubError(f"{file}: the {role} split cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise SdfhubError(f"{file}: not JSON: {error}") from error
+    if isinstance(content, dict) and content and content.keys() <= {"train", "test"}:
+        content = content.get(role, [])
+    try:
+        yield from _flattened(content)
+    except TypeError as error:
+        forms = '{"dataset": {"class": [ids]}}, [names] or {"train": [names], "test": [names]}'
+        raise SdfhubError(f"{file}: expected {forms}") from error
+
+
+def _flattened(content: object, prefix: str = "") -> Iterator[str]:
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _flattened(value, f"{prefix}{key}/")
+    elif isinstance(content, list) and all(isinstance(name, str) for name in content):
+        yield from (prefix + name for name in content)
+    else:
+        raise TypeError("neither a mapping nor a list of names")
+
+
+def _endings(path: str) -> Iterable[str]:
+    parts = path.split("/")
+    return ("/".join(parts[start:]) for start in range(len(parts)))

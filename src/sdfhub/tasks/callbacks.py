@@ -1,0 +1,87 @@
+"""What training shows of itself while it runs: meshes, slices and Chamfer distances in TensorBoard."""
+
+import fast_simplification
+import lightning as L
+import numpy as np
+import torch
+
+from sdfhub.data.shards import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesher import sdf_slice
+from sdfhub.geometry.metrics import judge
+from sdfhub.geometry.render import render, slice_image
+from sdfhub.model.autodecoder import AutoDecoder
+from sdfhub.tasks.evaluate import reconstruct
+
+TENSORBOARD_VERTICES = 60_000
+"""TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""
+
+
+class MeshShapes(L.Callback):
+    """Every so often: meshes the first shapes, logs their metrics, the meshes beside the truth, and slices.
+
+    A field without a zero crossing is logged (`surface/failed`), never an error.
+
+    Args:
+        every_n_epochs: how often, >= 1.
+        shapes: how many, from the front of the code table.
+        resolution: points along an axis of the marching-cubes grid.
+        points: surface points a side of the Chamfer distance.
+    """
+
+    METRICS = ("cd", "excess", "normal_consistency", "f_score")
+
+    def __init__(self, every_n_epochs: int, shapes: int, resolution: int, points: int):
+        if min(every_n_epochs, shapes, points) < 1 or resolution < 2:
+            raise ValueError("every_n_epochs, shapes and points must be at least 1, resolution at least 2")
+        self.every_n_epochs, self.shapes = every_n_epochs, shapes
+        self.resolution, self.points = resolution, points
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+        if trainer.is_global_zero and (trainer.current_epoch + 1) % self.every_n_epochs == 0:
+            self._show(trainer, module)
+
+    @torch.inference_mode()
+    def _show(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+        shapes = trainer.datamodule.batches.shapes[: self.shapes]
+        if any(shape.mesh is None for shape in shapes):
+            return  # sources without meshes have nothing to compare with
+        module.eval()
+        try:
+            rows = [self._show_shape(trainer, module, row, shape) for row, shape in enumerate(shapes)]
+        finally:
+            module.train()
+        judged = [row for row in rows if not row.failed]
+        values = {f"surface/{key}": np.mean([getattr(row, key) for row in judged]) for key in self.METRICS if judged}
+        values["surface/failed"] = len(rows) - len(judged)
+        trainer.logger.log_metrics({key: float(value) for key, value in values.items()}, trainer.global_step)
+
+    def _show_shape(self, trainer: L.Trainer, module: AutoDecoder, row: int, shape: StoredShape):
+        writer, step = trainer.logger.experiment, trainer.global_step
+        code = module.codes.table[row]
+        try:
+            vertices, faces = reconstruct(module.decoder, code, self.resolution)
+        except SdfhubError:  # a field that is not finite: the loss will say so, with a hint
+            vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
+        truth = shape.mesh
+        self._add_mesh(writer, f"{shape.id}/truth", truth.vertices, truth.faces, 0)
+        if len(faces):
+            self._add_mesh(writer, f"{shape.id}/reconstruction", vertices, faces, step)
+            sides = [render(truth.vertices, truth.faces), render(vertices, faces)]
+            writer.add_image(f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC")
+        grid = sdf_slice(lambda x: module.decoder(x[None], code[None])[0], axis=0, device=code.device)
+        writer.add_image(f"{shape.id}/slice_x0", slice_image(grid, module.loss.delta), step, dataformats="HWC")
+        return judge((vertices, faces), truth, points=self.points)
+
+    @staticmethod
+    def _add_mesh(writer, tag: str, vertices: np.ndarray, faces: np.ndarray, step: int) -> None:
+        if len(vertices) > TENSORBOARD_VERTICES:
+            vertices, faces = fast_simplification.simplify(
+                vertices.astype(np.float32), faces, 1 - TENSORBOARD_VERTICES / len(vertices)
+            )
+        writer.add_mesh(
+            tag,
+            torch.as_tensor(np.asarray(vertices, np.float32))[None],
+            faces=torch.as_tensor(np.asarray(faces, np.int32))[None],
+            global_step=step,
+        )

@@ -1,0 +1,152 @@
+"""What an evaluation found, for readers: the table, `metrics.json`, `metrics.csv`, meshes, the contact sheet."""
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from sdfhub.data.shards import StoredShape
+from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.metrics import ShapeMetrics, summarize
+from sdfhub.geometry.render import render
+from sdfhub.tasks.run import write_text
+
+COLUMNS = {
+    "cd": "CD x10^3",
+    "floor": "floor",
+    "excess": "excess",
+    "normal_consistency": "normals",
+    "f_score": "F-score",
+}
+"""Metrics of the printed table and their headings; the files carry all of them."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One judged shape: who it is, how good it is, and what it looks like in the normalised frame."""
+
+    role: str
+    shape: StoredShape
+    metrics: ShapeMetrics
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def write_scores(judged: Sequence[Judged], evaluation: Any, out: Path) -> dict[str, Any]:
+    """Writes `metrics.json`, `metrics.csv`, `meshes/` and `contact_sheet.png` below `out`; prints the table.
+
+    Args:
+        judged: what was judged, in the order of the table.
+        evaluation: a dataclass of the settings, kept beside the numbers.
+        out: folder of the results.
+
+    Returns:
+        What `metrics.json` holds: the settings and, per role, a `summary` and the rows of its `shapes`.
+    """
+    result: dict[str, Any] = {"evaluation": dataclasses.asdict(evaluation)}
+    for role in dict.fromkeys(row.role for row in judged):
+        rows = [row for row in judged if row.role == role]
+        shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
+        result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
+    write_text(out / "metrics.json", json.dumps(result, indent=1))
+    write_text(out / "metrics.csv", _csv(judged))
+    for row in judged:
+        _write_mesh(row, out / "meshes" / row.role / f"{row.shape.id}.ply")
+    _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
+    print(table(judged))
+    print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
+    print(f"metrics:       {out / 'metrics.json'}\nTensorBoard:   tensorboard --logdir {out}")
+    return result
+
+
+def table(judged: Sequence[Judged]) -> str:
+    """The Chamfer table: a line a shape, then mean and median, known and held-out shapes apart."""
+    width = max([len(row.shape.id) for row in judged] + [len("90th percentile")]) + 2
+    lines = []
+    for role in dict.fromkeys(row.role for row in judged):
+        rows = [row for row in judged if row.role == role]
+        title = "known shapes" if role == "known" else "held-out shapes"
+        lines += ["", f"{title:<{width}}" + "".join(f"{heading:>11}" for heading in COLUMNS.values())]
+        lines += [f"{row.shape.id:<{width}}{_cells(row.metrics)}" for row in rows]
+        whole = [row.metrics for row in rows if not row.metrics.failed]
+        statistics = {"mean": np.mean, "median": np.median, "90th percentile": partial(np.quantile, q=0.9)}
+        for name, statistic in statistics.items() if whole else ():
+            values = {key: float(statistic([getattr(m, key) for m in whole])) for key in COLUMNS}
+            lines.append(f"{name:<{width}}" + "".join(_number(key, values[key]) for key in COLUMNS))
+        lines.append(f"{'without surface':<{width}}{len(rows) - len(whole):>11} of {len(rows)}")
+    return "\n".join(lines)
+
+
+def _cells(metrics: ShapeMetrics) -> str:
+    if metrics.failed:
+        return f"{'no surface':>11}"
+    return "".join(_number(key, getattr(metrics, key)) for key in COLUMNS)
+
+
+def _number(key: str, value: float) -> str:
+    thousandfold = key in ("cd", "floor", "excess")
+    return f"{value * 1e3 if thousandfold else value:>11.4f}"
+
+
+def _csv(judged: Sequence[Judged]) -> str:
+    fields = [field.name for field in dataclasses.fields(ShapeMetrics)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["role", "id", *fields])
+    for row in judged:
+        writer.writerow([row.role, row.shape.id, *(getattr(row.metrics, field) for field in fields)])
+    return text.getvalue()
+
+
+def _write_mesh(row: Judged, path: Path) -> None:
+    """The reconstruction as PLY, back in its source's frame; nothing where there is no surface."""
+    if not len(row.faces):
+        return
+    vertices = row.vertices / row.shape.scale + row.shape.center
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".part.ply")
+    trimesh.Trimesh(vertices, row.faces, process=False).export(beside)
+    beside.replace(path)
+
+
+def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
+    """Ground truth above reconstruction, known shapes first."""
+    shown = [row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]]
+    truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces) for row in shown]
+    ours = [render(row.vertices, row.faces) if len(row.faces) else None for row in shown]
+    captions = [f"{row.shape.id} ({row.role.replace('_', ' ')})" for row in shown]
+    contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
+
+
+def write_distances(rows: Sequence[tuple[str, StoredShape, dict[str, float]]], out: Path) -> dict[str, Any]:
+    """The scores of shapes without a mesh: `metrics.json`, `metrics.csv` and a printed table.
+
+    Args:
+        rows: role, shape and its distance errors.
+        out: folder of the results.
+    """
+    result: dict[str, Any] = {}
+    lines, heads = [["role", "id", *rows[0][2]]], list(rows[0][2])
+    for role, shape, errors in rows:
+        entry = result.setdefault(role, {"summary": {}, "shapes": []})
+        entry["shapes"].append({"id": shape.id, **errors})
+        lines.append([role, shape.id, *errors.values()])
+    for entry in result.values():
+        for head in heads:
+            values = [row[head] for row in entry["shapes"]]
+            entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}
+    write_text(out / "metrics.json", json.dumps(result, indent=1))
+    write_text(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
+    print("\nthis source holds no meshes: judged by signed distances, not by surfaces")
+    for line in lines:
+        print("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))
+    print(f"metrics:       {out / 'metrics.json'}\nTensorBoard:   tensorboard --logdir {out}")
+    return result

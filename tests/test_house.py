@@ -1,0 +1,80 @@
+"""The rules of the house: which way imports point, how files are named, how long they may be."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "sdfhub"
+FILES = sorted(SOURCE.rglob("*.py"))
+FORBIDDEN_IMPORTS = {
+    "data": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.model", "sdfhub.geometry"),
+    "model": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.data", "sdfhub.geometry"),
+    "geometry": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.data", "sdfhub.model"),
+}
+FORBIDDEN_NAMES = {"utils", "util", "helpers", "helper", "manager", "base", "common"}
+MACHINE_PATH = re.compile(r"""["'`(\s=](/(?:home|work|tmp|root|Users|mnt|data|opt|scratch)/\w|[A-Z]:\\\w)""")
+
+
+def ids(path):
+    return str(path.relative_to(ROOT))
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Absolute names of all that a file imports, wherever in the file it does so."""
+    package = list(path.relative_to(SOURCE.parent).parent.parts)
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*start, *([node.module] if node.module else [])])
+            names |= {f"{module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def test_there_are_files_to_judge():
+    assert len(FILES) > 10 and all((SOURCE / part).is_dir() for part in FORBIDDEN_IMPORTS)
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_imports_point_down(path):
+    part = path.relative_to(SOURCE).parts[0]
+    for name in imported_modules(path):
+        for forbidden in FORBIDDEN_IMPORTS.get(part, ()):
+            assert name != forbidden and not name.startswith(f"{forbidden}."), f"{ids(path)} imports {name}"
+
+
+@pytest.mark.parametrize("name", ["errors", "shapes"])
+def test_the_seams_import_no_part_of_the_house(name):
+    assert not [n for n in imported_modules(SOURCE / f"{name}.py") if n.startswith("sdfhub")]
+
+
+def test_the_import_parser_sees_every_form(tmp_path, monkeypatch):
+    monkeypatch.setitem(globals(), "SOURCE", tmp_path / "sdfhub")
+    path = tmp_path / "sdfhub" / "data" / "x.py"
+    path.parent.mkdir(parents=True)
+    path.write_text("import a.b\nfrom c import d\ndef f():\n    from ..model import e\n    from . import g\n")
+    assert imported_modules(path) == {"a.b", "c.d", "sdfhub.model.e", "sdfhub.data.g"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_a_module_is_named_for_the_thing_in_it(path):
+    assert not FORBIDDEN_NAMES & {part.removesuffix(".py") for part in path.relative_to(SOURCE).parts}
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_a_file_is_short(path):
+    assert len(path.read_text().splitlines()) <= 350
+
+
+def test_train_is_at_most_15_lines():
+    assert len((ROOT / "train.py").read_text().splitlines()) <= 15
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_no_file_mentions_a_path_of_one_machine(path):
+    assert not MACHINE_PATH.search(path.read_text())

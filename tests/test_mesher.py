@@ -1,0 +1,234 @@
+"""The coarse-to-fine mesh is the dense one; both lie where the field says, and face outward."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry import mesher
+from sdfhub.geometry.mesher import mesh_dense, mesh_field, sdf_slice
+from sdfhub.geometry.metrics import is_closed
+
+RADIUS = 0.6
+
+
+def sphere(points):
+    return points.norm(dim=-1) - RADIUS
+
+
+def torus(points):
+    return torch.hypot(torch.hypot(points[:, 0], points[:, 1]) - 0.6, points[:, 2]) - 0.1
+
+
+def box(points, centre, half):
+    q = (points - torch.tensor(centre)).abs() - torch.tensor(half)
+    return q.clamp(min=0).norm(dim=-1) + q.max(dim=-1).values.clamp(max=0)
+
+
+def boxes(points):
+    seat = box(points, (0.0, 0.0, 0.0), (0.5, 0.5, 0.05))
+    legs = [box(points, (x, 0.4, -0.4), (0.03, 0.02, 0.4)) for x in (-0.4, 0.4)]
+    return torch.stack([seat, *legs]).amin(dim=0)
+
+
+def rod(points, start, end):
+    start, end = torch.tensor(start), torch.tensor(end)
+    along = ((points - start) @ (end - start) / (end - start).square().sum()).clamp(0, 1)
+    return (points - start - along[:, None] * (end - start)).norm(dim=-1) - 0.01
+
+
+def rods(points):
+    first = rod(points, (-0.5, -0.5, -0.7), (0.5, 0.6, 0.8))
+    return torch.minimum(first, rod(points, (0.5, -0.5, -0.7), (-0.3, 0.6, 0.8)))
+
+
+def spheres_apart(points):
+    """Tiny spheres far from each other: what a coarse level may lose."""
+    centres = torch.tensor([[0.7, 0.7, 0.7], [-0.61, 0.13, 0.27], [0.05, -0.72, -0.33]])
+    return (points[:, None] - centres).norm(dim=-1).amin(dim=1) - 0.012
+
+
+def clamped_rods(points):
+    return rods(points).clamp(-0.1, 0.1)
+
+
+def flat_rods(points):
+    return 0.01 * rods(points)
+
+
+class Waves(torch.nn.Module):
+    """A small random network of sines, or of HOSC, with no likeness to a distance."""
+
+    def __init__(self, seed, hosc=False):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+
+        def uniform(*shape, scale):
+            return torch.nn.Parameter((2 * torch.rand(*shape, generator=generator) - 1) * scale)
+
+        self.first, self.hidden = uniform(3, 32, scale=1 / 3), uniform(32, 32, scale=0.25)
+        self.last, self.hosc = uniform(32, scale=0.1), hosc
+
+    def forward(self, points):
+        x = torch.sin(10 * points @ self.first)
+        x = torch.sin(3 * x @ self.hidden)
+        return (torch.tanh(2 * x) if self.hosc else x) @ self.last + 0.05
+
+
+class Counted:
+    def __init__(self, field):
+        self.field, self.count = field, 0
+
+    def __call__(self, points):
+        self.count += len(points)
+        return self.field(points)
+
+
+FIELDS = {
+    "sphere": sphere,
+    "torus": torus,
+    "boxes": boxes,
+    "rods": rods,
+    "clamped_rods": clamped_rods,
+    "flat_rods": flat_rods,
+    "spheres_apart": spheres_apart,
+    "siren": Waves(0),
+    "hosc": Waves(1, hosc=True),
+}
+
+
+def assert_same_mesh(have, want):
+    assert len(have[0]) == len(want[0]) and len(have[1]) == len(want[1])
+    # a node where the field is exactly 0 carries several vertices: compare places
+    places, row = np.unique(want[0], axis=0, return_inverse=True)
+    distance, partner = cKDTree(places).query(have[0])
+    assert distance.max(initial=0) < 1e-6
+    corners = np.sort(partner[have[1]], axis=1), np.sort(row.reshape(-1)[want[1]], axis=1)
+    assert np.array_equal(*(np.sort(c @ [1, 10**6, 10**12]) for c in corners))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("resolution", [64, 97])
+def test_coarse_to_fine_equals_dense(name, resolution):
+    field = FIELDS[name]
+    want = mesh_dense(field, resolution)
+    assert len(want[0])
+    assert_same_mesh(mesh_field(field, resolution, coarse=16), want)
+
+
+def test_slabs_join_to_the_dense_mesh(monkeypatch):
+    monkeypatch.setattr(mesher, "_SLAB_NODES", 10 * 64**2)
+    have = mesh_field(torus, 64)
+    assert_same_mesh(have, mesh_dense(torus, 64))
+    assert is_closed(*have)
+
+
+def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
+    want = mesh_dense(torus, 96)
+    index = (want[0][0] + 1) * 95 / 2
+    seen = np.zeros((48, 48, 48), bool)
+    seen[tuple((index // 2).astype(int))] = True
+    monkeypatch.setattr(mesher, "_active_blocks", lambda *_: seen)
+    assert_same_mesh(mesh_field(torus, 96), want)
+
+
+def test_a_chair_like_field_needs_few_evaluations():
+    field = Counted(boxes)
+    mesh_field(field, 256)
+    assert field.count < 0.06 * 256**3
+
+
+def test_vertices_lie_on_the_surface():
+    vertices, faces = mesh_field(sphere, 64)
+    assert vertices.dtype == np.float64 and faces.dtype == np.int64
+    step = 2 / 63  # linear interpolation of a sphere is off by about step^2 / (8 R)
+    assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).max() < step**2 / RADIUS
+    assert np.abs(vertices.mean(axis=0)).max() < 1e-3
+
+
+def test_the_grid_includes_both_end_points():
+    seen = []
+
+    def field(points):
+        seen.append(points)
+        return sphere(points)
+
+    mesh_dense(field, 17, bound=1.1)
+    points = torch.cat(seen)
+    assert points.dtype == torch.float32
+    assert torch.allclose(points.amin(0), torch.tensor(-1.1))
+    assert torch.allclose(points.amax(0), torch.tensor(1.1))
+    assert len(points[:, 0].unique()) == 17
+    assert torch.allclose(points[:, 0].unique().diff(), torch.tensor(2.2 / 16), atol=1e-6)
+
+
+def test_a_plane_is_found_exactly_where_it_is():
+    vertices, _ = mesh_field(lambda p: p[:, 0] - 0.123, 50)
+    assert np.abs(vertices[:, 0] - 0.123).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus", "boxes", "rods"])
+def test_faces_look_outward_and_close(name):
+    vertices, faces = mesh_field(FIELDS[name], 96)
+    assert is_closed(vertices, faces)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
+
+
+@pytest.mark.parametrize("coarse", [None, 32])
+@pytest.mark.parametrize("shift", [5.0, -5.0])
+def test_no_zero_crossing_is_an_empty_mesh(coarse, shift):
+    vertices, faces = mesh_field(lambda p: sphere(p) + shift, 40, coarse=coarse)
+    assert vertices.shape == (0, 3) and faces.shape == (0, 3)
+    assert vertices.dtype == np.float64 and faces.dtype == np.int64
+
+
+def test_a_constant_field_is_an_empty_mesh():
+    for value in (0.0, 1.0):
+        assert len(mesh_field(lambda p, v=value: torch.full((len(p),), v), 40)[0]) == 0
+
+
+def test_a_field_that_is_not_finite_is_one_clear_line():
+    with pytest.raises(SdfhubError, match="not finite"):
+        mesh_field(lambda p: p[:, 0] / 0, 40)
+
+
+def test_a_field_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match="expected"):
+        mesh_field(lambda p: p, 40)
+
+
+def test_meshing_leaves_no_gradients():
+    network = Waves(0)
+    states = []
+
+    def field(points):
+        values = network(points)
+        states.append(values.requires_grad)
+        return values
+
+    mesh_field(field, 24)
+    assert states and not any(states)
+
+
+@pytest.mark.parametrize("resolution", [2, 3, 17, 18, 33])
+def test_any_resolution_works(resolution):
+    def corner(points):  # near a corner of the cube: the smallest grid crosses it too
+        return (points - 1).norm(dim=-1) - 0.9
+
+    want = mesh_dense(corner, resolution)
+    assert len(want[0])
+    assert_same_mesh(mesh_field(corner, resolution), want)
+
+
+def test_a_grid_without_a_cell_is_refused():
+    with pytest.raises(SdfhubError, match="at least 2"):
+        mesh_field(sphere, 1)
+
+
+def test_a_slice_lies_as_a_picture():
+    values = sdf_slice(lambda p: p[:, 0] + 10 * p[:, 2] + 100 * p[:, 1], axis=1, offset=0.25, resolution=33)
+    assert values.shape == (33, 33)
+    assert values[0, 0] == pytest.approx(25 + 10 - 1, abs=1e-4)  # top left: z = 1, x = -1
+    assert values[-1, -1] == pytest.approx(25 - 10 + 1, abs=1e-4)  # bottom right: z = -1, x = 1

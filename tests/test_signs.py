@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+from broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
+from manifold3d import Manifold, OpType
+
+from sdfhub.data.normalize import normalize_mesh
+from sdfhub.data.preparation import Preparation
+from sdfhub.data.sampling import sample_points
+from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
+from sdfhub.data.visibility import closed_surface, visible_surface
+
+CHAIR = triangles(refined(Manifold.batch_boolean(chair_parts(), OpType.Add)))
+
+
+def surface_and_points(mesh, count=20_000, closed=False):
+    normalized = normalize_mesh(*mesh)
+    rng = np.random.default_rng(0)
+    surface = closed_surface(normalized) if closed else visible_surface(normalized, Preparation(), rng)
+    return surface, sample_points(surface, Preparation(samples=count), rng)
+
+
+@pytest.mark.parametrize("mesh", [CHAIR, triangles(ring())], ids=["chair", "ring"])
+def test_fast_path_equals_the_winding_path_on_clean_meshes(mesh):
+    surface, points = surface_and_points(mesh, closed=True)
+    nearest, rng = nearest_points(points, surface), np.random.default_rng(0)
+    fast = SIGN_METHODS["pseudo_normal"](points, nearest, surface, rng)
+    slow = SIGN_METHODS["winding"](points, nearest, surface, rng)
+    np.testing.assert_array_equal(fast.inside, slow.inside)
+
+
+def test_winding_numbers_shared_within_empty_balls_equal_those_of_every_point():
+    import igl
+
+    mesh = punctured(CHAIR, np.random.default_rng(0))
+    surface, points = surface_and_points(mesh)
+    signs = winding_signs(points, nearest_points(points, surface), surface, np.random.default_rng(0))
+    every = igl.fast_winding_number(surface.vertices, surface.solid(), points)
+    assert np.mean(signs.inside != (every > 0.5)) < 1e-4
+
+
+@pytest.mark.parametrize("method", SIGN_METHODS)
+def test_signs_do_not_depend_on_the_order_of_the_points(method):
+    surface, points = surface_and_points(CHAIR, 3000)
+    shuffle = np.random.default_rng(1).permutation(len(points))
+    sign = SIGN_METHODS[method]
+    one = sign(points, nearest_points(points, surface), surface, np.random.default_rng(0))
+    other = sign(
+        points[shuffle], nearest_points(points[shuffle], surface), surface, np.random.default_rng(0)
+    )
+    np.testing.assert_array_equal(one.inside[shuffle], other.inside)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_few_points_are_signed_too(count):
+    surface, points = surface_and_points(CHAIR, 50)
+    signs = winding_signs(
+        points[:count], nearest_points(points[:count], surface), surface, np.random.default_rng(0)
+    )
+    truth = signed_distance((surface.vertices, surface.faces), points[:count]) < 0
+    np.testing.assert_array_equal(signs.inside, truth)
+
+
+def test_morton_order_keeps_neighbours_together():
+    points = np.random.default_rng(0).uniform(-1, 1, (4096, 3))
+    order = morton_order(points)
+    assert sorted(order) == list(range(4096))
+    steps = np.linalg.norm(np.diff(points[order], axis=0), axis=1)
+    assert steps.mean() < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
+
+
+def test_hidden_faces_go_and_flipped_ones_turn():
+    shell = triangles(refined(Manifold.sphere(1, 48), 0.2))
+    inner = triangles(Manifold.sphere(0.5, 32))
+    vertices = np.concatenate([shell[0], inner[0]])
+    faces = np.concatenate([shell[1][:, ::-1], inner[1] + len(shell[0])])
+    surface = visible_surface(normalize_mesh(vertices, faces), Preparation(), np.random.default_rng(0))
+    assert len(surface.faces) == len(shell[1])
+    corners = surface.vertices[surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("nj,nj->n", normals, corners.mean(axis=1)) > 0).all()
+    assert not surface.two_sided.any()

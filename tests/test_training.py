@@ -1,0 +1,222 @@
+"""Losses, schedules, batches and fitting: the equations and the order of the draws."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sdfhub.data.datamodule import Augmentation, EpochSteps, StepBatches, wrapping_slice
+from sdfhub.errors import SdfhubError
+from sdfhub.model.fitting import MapFit
+from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term, spatial_gradient
+from sdfhub.model.optim import Adam, Constant, Cosine, StepDecay
+from sdfhub.shapes import Batch
+from tests.test_model import small_decoder
+
+LOSS = SdfLoss(delta=0.1, lambda_code=1e-4, code_norm="squared", warmup_epochs=100, tau=0.01)
+
+
+@dataclasses.dataclass
+class FakeShape:
+    """Arrays in the place of a stored shape: a ball of a given radius."""
+
+    radius: float
+
+    def __post_init__(self):
+        rng = np.random.default_rng(int(self.radius * 1000))
+        points = rng.uniform(-1, 1, (4000, 3)).astype(np.float32)
+        sdf = np.linalg.norm(points, axis=1) - np.float32(self.radius)
+        rows = np.column_stack([points, sdf]).astype(np.float32)
+        self.outside, self.inside = rows[sdf >= 0], rows[sdf < 0]
+        normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+        self.surface = np.column_stack([normals * self.radius, normals]).astype(np.float32)
+
+
+def batches(shapes=5, per_step=2, samples=64, surface=16, augmentation=None, seed=0) -> StepBatches:
+    balls = [FakeShape(0.4 + 0.05 * index) for index in range(shapes)]
+    return StepBatches(balls, per_step, samples, surface, augmentation or Augmentation(), seed)
+
+
+def test_clamped_l1_counts_only_the_band():
+    predicted, target = torch.tensor([[0.05, 0.5, -0.5, 0.3]]), torch.tensor([[0.02, 0.2, 0.2, 0.05]])
+    assert torch.isclose(clamped_l1(predicted, target, 0.1), torch.tensor((0.03 + 0 + 0.2 + 0.05) / 4))
+
+
+def test_code_prior_is_the_papers_square_or_deepsdfs_norm():
+    codes = torch.tensor([[3.0, 4.0], [0.0, 0.0]], requires_grad=True)
+    assert code_prior(codes, "squared") == 12.5
+    assert torch.isclose(code_prior(codes, "l2"), torch.tensor(2.5))
+    code_prior(codes, "l2").backward()
+    assert torch.isfinite(codes.grad).all()
+
+
+def test_normal_term_is_the_mean_squared_difference():
+    gradients, normals = torch.zeros(1, 2, 3), torch.tensor([[[1.0, 0, 0], [0, 2.0, 0]]])
+    assert normal_term(gradients, normals) == 2.5
+
+
+def test_spatial_gradient_of_a_known_field_and_its_way_to_the_weights():
+    weight = torch.tensor(2.0, requires_grad=True)
+    points = torch.rand(2, 5, 3)
+    values, gradients = spatial_gradient(lambda x: weight * x.square().sum(-1), points)
+    assert torch.allclose(values, 2 * points.square().sum(-1))
+    assert torch.allclose(gradients, 4 * points)
+    gradients.sum().backward()
+    assert torch.isclose(weight.grad, (2 * points).sum())
+
+
+def test_prior_warms_up_and_parts_add_their_weights():
+    args = torch.zeros(1, 4), torch.zeros(1, 4), torch.ones(1, 4)
+    half = LOSS.parts(*args, None, None, epoch=50)
+    assert torch.isclose(half["code"], torch.tensor(1e-4 * 0.5 * 4))
+    assert torch.isclose(LOSS.parts(*args, None, None, epoch=500)["code"], torch.tensor(1e-4 * 4))
+    with_normals = LOSS.parts(*args, torch.zeros(1, 2, 3), torch.ones(1, 2, 3), epoch=0)
+    assert torch.isclose(with_normals["normal"], torch.tensor(0.01 * 3))
+    assert set(half) == {"sdf", "code"}
+
+
+def test_normals_may_come_in_later():
+    late = dataclasses.replace(LOSS, tau_start=0.4)
+    assert not late.wants_gradients(0.39)
+    assert late.wants_gradients(0.4)
+    assert not dataclasses.replace(LOSS, tau=0.0).wants_gradients(1.0)
+
+
+def test_step_schedule_halves_every_500_of_2000_epochs():
+    schedule = StepDecay(every=0.25, factor=0.5)
+    assert [schedule(epoch / 2000) for epoch in (0, 499, 500, 1000, 1999)] == [1, 1, 0.5, 0.25, 0.125]
+
+
+def test_cosine_schedule_rises_then_falls_to_its_end():
+    schedule = Cosine(warmup=0.1, final=0.01)
+    assert schedule(0.05) == pytest.approx(0.5)
+    assert schedule(0.1) == pytest.approx(1)
+    assert schedule(1.0) == pytest.approx(0.01)
+    assert schedule(0.55) == pytest.approx((1 + 0.01) / 2)
+
+
+def test_each_group_has_its_own_learning_rate():
+    decoder, codes = torch.nn.Parameter(torch.ones(2)), torch.nn.Parameter(torch.ones(2))
+    optimizer, _ = Adam(1e-3, 1e-2, Constant()).configure([decoder], [codes], steps=10)
+    assert {group["name"]: group["lr"] for group in optimizer.param_groups} == {"decoder": 1e-3, "codes": 1e-2}
+
+
+def test_wrapping_slice_reaches_every_row_equally():
+    array, rng = np.arange(10)[:, None], np.random.default_rng(0)
+    drawn = np.concatenate([wrapping_slice(array, 4, rng) for _ in range(5000)])[:, 0]
+    assert np.bincount(drawn, minlength=10).std() < 60
+    assert len(wrapping_slice(array, 25, rng)) == 25
+    assert wrapping_slice(array, 0, rng).shape == (0, 1)
+
+
+def test_a_batch_is_a_function_of_seed_and_step():
+    one, two, other = batches()[7], batches()[7], batches(seed=1)[7]
+    assert torch.equal(one.points, two.points) and torch.equal(one.rows, two.rows)
+    assert not torch.equal(one.points, other.points)
+    assert not torch.equal(one.points, batches()[8].points)
+
+
+def test_half_of_the_samples_are_inside():
+    assert ((batches()[0].sdf < 0).sum(dim=1) == 32).all()
+
+
+def test_a_pass_visits_no_shape_twice_and_the_next_shuffles_anew():
+    stream = batches(shapes=6, per_step=2)
+    passes = [torch.cat([stream[p * 3 + i].rows for i in range(3)]).tolist() for p in range(4)]
+    assert all(sorted(rows) == list(range(6)) for rows in passes)
+    assert len({tuple(rows) for rows in passes}) > 1
+
+
+def test_processes_share_a_step_without_overlap():
+    whole, halves = batches(per_step=4)[3], []
+    for rank in range(2):
+        stream = batches(per_step=4)
+        stream.share(rank, 2)
+        halves.append(stream[3])
+    assert sorted(torch.cat([half.rows for half in halves]).tolist()) == sorted(whole.rows.tolist())
+    merged = {int(r): p for half in halves for r, p in zip(half.rows, half.points, strict=True)}
+    assert all(torch.equal(merged[int(r)], p) for r, p in zip(whole.rows, whole.points, strict=True))
+    with pytest.raises(SdfhubError, match="multiple of 3"):
+        batches(per_step=4).share(0, 3)
+
+
+def test_an_epoch_goes_on_where_the_last_ended():
+    steps = EpochSteps(4)
+    steps.set_epoch(2)
+    assert list(steps) == [8, 9, 10, 11]
+
+
+def test_augmented_copies_are_exact_signed_distances_of_similar_shapes():
+    stream = batches(shapes=2, per_step=6, augmentation=Augmentation(copies=2, smallest=0.5))
+    assert stream.rows == 6
+    batch = stream[0]
+    radius = (batch.points.norm(dim=-1) - batch.sdf).mean(dim=1)  # a scaled ball is a ball
+    assert torch.allclose(batch.points.norm(dim=-1) - radius[:, None], batch.sdf, atol=1e-5)
+    assert torch.allclose(batch.surface_normals.norm(dim=-1), torch.ones(6, 16), atol=1e-5)
+    outward = (batch.surface_points * batch.surface_normals).sum(-1)
+    assert torch.allclose(outward, radius[:, None].expand_as(outward), atol=1e-4)
+    assert len({round(float(r), 4) for r in radius}) == 6
+
+
+def test_a_wrong_batch_is_refused_at_its_seam():
+    rows, points = torch.zeros(2, dtype=torch.int64), torch.zeros(2, 4, 3)
+    none = torch.zeros(2, 0, 3)
+    with pytest.raises(ValueError, match="sdf"):
+        Batch(rows, points, torch.zeros(2, 5), none, none)
+    with pytest.raises(ValueError, match="rows"):
+        Batch(rows.float(), points, torch.zeros(2, 4), none, none)
+
+
+def train_balls(decoder, codes, steps: int = 250) -> None:
+    stream = batches(shapes=4, per_step=4, samples=256, surface=0)
+    optimizer = torch.optim.Adam([*decoder.parameters(), codes], lr=5e-3)
+    for step in range(steps):
+        batch = stream[step]
+        loss = clamped_l1(decoder(batch.points, codes[batch.rows]), batch.sdf, 0.1)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
+def test_map_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone():
+    decoder = small_decoder(width=32)
+    codes = torch.nn.Parameter(torch.randn(4, 4) * 0.5)
+    train_balls(decoder, codes)
+    before = {name: value.clone() for name, value in decoder.state_dict().items()}
+    unseen = StepBatches([FakeShape(0.47), FakeShape(0.52)], 2, 256, 0, Augmentation(), seed=3)
+
+    def draw(step):
+        batch = unseen[step]
+        order = batch.rows.argsort()
+        return batch.points[order], batch.sdf[order]
+
+    fit = MapFit(steps=100, lr=2e-2, samples=256, spread=0.01, lambda_code=1e-4, delta=0.1)
+    fitted = fit(decoder, draw, 2)
+    points, sdf = draw(1000)
+    error = clamped_l1(decoder(points, fitted), sdf, 0.1)
+    assert error < 0.3 * clamped_l1(decoder(points, torch.zeros(2, 4)), sdf, 0.1)
+    assert error < 0.02
+    assert all(torch.equal(before[name], value) for name, value in decoder.state_dict().items())
+    assert all(parameter.requires_grad for parameter in decoder.parameters())
+
+
+def test_shapes_fitted_together_get_the_codes_they_get_alone():
+    decoder = small_decoder(width=16)
+    one, two = FakeShape(0.45), FakeShape(0.6)
+    fit = MapFit(steps=20, lr=5e-3, samples=64, spread=0.0, lambda_code=1e-4, delta=0.1)
+    data = [torch.from_numpy(np.concatenate([s.outside[:32], s.inside[:32]])) for s in (one, two)]
+    together = torch.stack(data)
+    both = fit(decoder, lambda step: (together[..., :3], together[..., 3]), 2)
+    for index in range(2):
+        alone_data = together[index : index + 1]
+        alone = fit(decoder, lambda step, d=alone_data: (d[..., :3], d[..., 3]), 1)
+        # the prior is a mean over all numbers of all codes, hence the looseness
+        assert torch.allclose(both[index], alone[0], atol=1e-3)
+
+
+def test_fit_settings_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="at least 1"):
+        MapFit(steps=0, lr=1e-3, samples=1, spread=0.0, lambda_code=0.0, delta=0.1)
+    assert math.isfinite(MapFit(steps=1, lr=1e-3, samples=1, spread=0.0, lambda_code=0.0, delta=0.1).lr)
