@@ -227,8 +227,8 @@ def test_a_grid_without_a_cell_is_refused():
         mesh_field(sphere, 1)
 
 
-def test_a_slice_lies_as_a_picture():
+def test_a_slice_keeps_the_order_of_its_axes():
     values = sdf_slice(lambda p: p[:, 0] + 10 * p[:, 2] + 100 * p[:, 1], axis=1, offset=0.25, resolution=33)
     assert values.shape == (33, 33)
-    assert values[0, 0] == pytest.approx(25 + 10 - 1, abs=1e-4)  # top left: z = 1, x = -1
-    assert values[-1, -1] == pytest.approx(25 - 10 + 1, abs=1e-4)  # bottom right: z = -1, x = 1
+    assert values[0, -1] == pytest.approx(25 - 1 + 10, abs=1e-4)  # x = -1, z = 1
+    assert values[-1, 0] == pytest.approx(25 + 1 - 10, abs=1e-4)  # x = 1, z = -1

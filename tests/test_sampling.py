@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
-from broken_twins import BREAKAGES, chair_parts, errors, refined, ring, signed_distance, triangles
+from tests.broken_twins import BREAKAGES, chair_parts, errors, refined, ring, signed_distance, triangles
 from manifold3d import CrossSection, Manifold, OpType
 
 from sdfhub.data.preparation import Preparation

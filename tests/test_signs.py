@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
+from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 from manifold3d import Manifold, OpType
 
 from sdfhub.data.normalize import normalize_mesh

@@ -173,6 +173,15 @@ def test_a_killed_run_keeps_whole_shapes_only(tmp_path, monkeypatch):
     assert not [path for path in folder.rglob(".*") if path.name != ".lock"]  # nothing half left over
 
 
+def test_leftovers_of_killed_runs_go_away(tmp_path):
+    folder = fill(tmp_path, Balls(1)).folder
+    for name, age in ((".old.1", 9999), (".new.1", 0)):
+        (folder / "balls" / name).mkdir()
+        os.utime(folder / "balls" / name, (time.time() - age,) * 2)
+    fill(tmp_path, Balls(2))
+    assert [path.name for path in (folder / "balls").glob(".*")] == [".new.1"]
+
+
 def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(shards.os, "fsync", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(SdfhubError, match="disk full"):

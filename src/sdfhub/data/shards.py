@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -59,6 +60,13 @@ def write_shape(folder: Path, arrays: Mapping[str, np.ndarray], record: dict) ->
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return record
+
+
+def remove_leftovers(store: Path) -> None:
+    """Removes the half-written shapes of runs that were killed more than an hour ago."""
+    for leftover in store.glob("*/.*"):
+        if time.time() - leftover.stat().st_mtime > 3600:
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def read_record(folder: Path) -> dict | None:

@@ -188,6 +188,7 @@ class _PrepareShape:
 
 
 def _fill(source, shapes, preparation, folder, workers, progress) -> dict:
+    shards.remove_leftovers(folder)
     manifest = _read_manifest(folder) or _new_manifest(source, preparation)
     for shape in _missing(shapes, manifest):
         record = shards.read_record(folder / shape.id)

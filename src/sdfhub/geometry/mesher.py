@@ -99,24 +99,21 @@ def sdf_slice(
     batch: int = 2**18,
     device: torch.device | str | None = None,
 ) -> np.ndarray:
-    """The field on a plane across one axis, laid out as a picture.
+    """The field on a plane across one axis.
 
     Args:
         field: as for `mesh_field`.
         axis: 0, 1 or 2, the axis that the plane is perpendicular to.
         offset: the plane's coordinate on that axis, normalised frame.
-        resolution: R, pixels per side; the outermost lie on the cube's faces.
+        resolution: R, nodes per side; the outermost lie on the cube's faces.
         bound, batch, device: as for `mesh_field`.
 
     Returns:
-        [R, R] float32. Of the two axes left, the later points up (row 0 is +bound), the earlier right.
+        [R, R] float32, one index for each of the two axes left, in their order, both ascending.
     """
     grid = _Grid(field, resolution, bound, batch, _device_of(field, device))
-    up, right = np.indices((resolution, resolution)).reshape(2, -1)
-    across, upward = (a for a in range(3) if a != axis)
-    index = np.empty((resolution**2, 3))
-    index[:, axis] = (offset + bound) / grid.step
-    index[:, across], index[:, upward] = right, resolution - 1 - up
+    index = np.full((resolution**2, 3), (offset + bound) / grid.step)
+    index[:, [a for a in range(3) if a != axis]] = np.indices((resolution, resolution)).reshape(2, -1).T
     return grid.evaluate(index).reshape(resolution, resolution)
 
 

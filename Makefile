@@ -1,0 +1,44 @@
+# sdfhub: `make demo` and `make test` are all the set-up there is.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow lint data bench clean
+
+help: ## list these targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
+
+install: $(STAMP) ## make .venv and install into it what constraints.txt pins
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "sdfhub needs Python 3.11 or newer; say which: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: install ## train HOSC + Fourier + normals on procedural chairs and print the Chamfer table (minutes)
+	$(BIN)/python train.py activation=hosc encoding=fourier scale=demo
+
+test: install ## run the tests
+	$(BIN)/python -m pytest
+
+test-slow: install ## run the tests that take minutes as well
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+lint: install ## check style
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+data: install ## fetch and unpack the real meshes of data=open into data/open (no root needed)
+	$(BIN)/python -m sdfhub.data.fetch
+
+bench: install ## run the benchmarks
+	$(BIN)/python benchmarks/preparation.py
+	$(BIN)/python benchmarks/meshing.py
+	$(BIN)/python benchmarks/combinations.py
+
+clean: ## remove the environment; prepared data and runs stay
+	rm -rf $(VENV)
