@@ -20,16 +20,16 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):  # a rate per core needs one
     os.environ[name] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import numpy as np
-import trimesh
-from manifold3d import Manifold, OpType
+import numpy as np  # noqa: E402
+import trimesh  # noqa: E402
+from manifold3d import Manifold, OpType  # noqa: E402
 
-from sdfhub.data import sampling
-from sdfhub.data.preparation import Preparation
-from sdfhub.data.procedural import generate
-from sdfhub.data.signs import SIGN_METHODS
-from sdfhub.errors import RejectedMesh
-from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles
+from sdfhub.data import sampling  # noqa: E402
+from sdfhub.data.preparation import Preparation  # noqa: E402
+from sdfhub.data.procedural import generate  # noqa: E402
+from sdfhub.data.signs import SIGN_METHODS  # noqa: E402
+from sdfhub.errors import RejectedMesh  # noqa: E402
+from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 
 SUFFIXES = {".obj", ".ply", ".stl", ".off", ".glb"}
 STAGES = {"visible_surface": "rays", "nearest_points": "distance"}

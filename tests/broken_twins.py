@@ -88,7 +88,7 @@ BREAKAGES: dict[str, Callable[[Triangles, np.random.Generator], Triangles]] = {
 
 
 def signed_distance(clean: Triangles, points: np.ndarray) -> np.ndarray:
-    """[N] exact signed distances to a clean closed mesh, negative inside; the sum of all solid angles is the sign."""
+    """[N] exact signed distances to a clean closed mesh, negative inside; signs by its winding number."""
     tree = igl.AABB()
     tree.init(*clean)
     distance = np.sqrt(tree.squared_distance(*clean, points)[0])

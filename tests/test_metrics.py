@@ -179,7 +179,7 @@ def test_summary_of_failures_alone_has_no_means():
 
 
 def test_judging_is_quick():
-    mesh = icosphere(subdivisions=7)  # 327,680 faces, more than a chair at 256^3
+    mesh = icosphere(subdivisions=7)  # 327,680 faces, twice a chair at 256^3
     start = time.process_time()
     judge(mesh, truth(icosphere()))
-    assert time.process_time() - start < 5  # well under 1 s on a chair; the slack is for busy machines
+    assert time.process_time() - start < 5  # 2 to 3 s measured, two cores shared by five

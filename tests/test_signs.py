@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 from manifold3d import Manifold, OpType
 
 from sdfhub.data.normalize import normalize_mesh
@@ -8,6 +7,7 @@ from sdfhub.data.preparation import Preparation
 from sdfhub.data.sampling import sample_points
 from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
 from sdfhub.data.visibility import closed_surface, visible_surface
+from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
 CHAIR = triangles(refined(Manifold.batch_boolean(chair_parts(), OpType.Add)))
 
@@ -44,9 +44,7 @@ def test_signs_do_not_depend_on_the_order_of_the_points(method):
     shuffle = np.random.default_rng(1).permutation(len(points))
     sign = SIGN_METHODS[method]
     one = sign(points, nearest_points(points, surface), surface, np.random.default_rng(0))
-    other = sign(
-        points[shuffle], nearest_points(points[shuffle], surface), surface, np.random.default_rng(0)
-    )
+    other = sign(points[shuffle], nearest_points(points[shuffle], surface), surface, np.random.default_rng(0))
     np.testing.assert_array_equal(one.inside[shuffle], other.inside)
 
 

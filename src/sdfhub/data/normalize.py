@@ -4,21 +4,22 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sdfhub.data.preparation import Preparation
+from sdfhub.data.preparation import DEFAULT, Preparation
 from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import RADIUS, NormalizedMesh
 
 ZERO_AREA = 1e-15
-"""Area below which a triangle counts as none, normalised units squared: what rounding alone leaves of a line."""
+"""Area, in normalised units squared, that rounding alone may leave of a line; such a triangle has none."""
 
 
 def normalize_mesh(
-    vertices: np.ndarray, faces: np.ndarray, preparation: Preparation = Preparation()
+    vertices: np.ndarray, faces: np.ndarray, preparation: Preparation = DEFAULT
 ) -> NormalizedMesh:
     """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
 
     The frame comes before the merging: a tolerance means something only once the size is known, and a mesh
-    of scale 1e20 or 1e-12 must survive it. Triangles with the same three corners count once, whichever way they turn.
+    of scale 1e20 or 1e-12 must survive it. Triangles with the same three corners count once, whichever way
+    they turn.
 
     Args:
         vertices: [V, 3] numbers, source units.
@@ -36,7 +37,8 @@ def normalize_mesh(
     faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
     count = len(np.unique(face_components(faces, len(vertices))))
     if count > preparation.max_components:
-        raise RejectedMesh("too_many_components", f"{count} pieces, at most {preparation.max_components} wanted")
+        limit = preparation.max_components
+        raise RejectedMesh("too_many_components", f"{count} pieces, at most {limit} wanted")
     return NormalizedMesh(vertices, faces, center, scale)
 
 
@@ -66,13 +68,14 @@ def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 def _normalized(
     vertices: np.ndarray, faces: np.ndarray, min_extent_ratio: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    used, faces_flat = np.unique(faces, return_inverse=True)
+    used = np.unique(faces)
     corners = vertices[used]
     low, high = corners.min(axis=0), corners.max(axis=0)
     half = high / 2 - low / 2  # halves first: the sum of two large numbers may overflow
     if not half.max() > 0 or half.min() / half.max() < min_extent_ratio:
         ratio = half.min() / half.max() if half.max() > 0 else 0.0
-        raise RejectedMesh("flat", f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted")
+        detail = f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted"
+        raise RejectedMesh("flat", detail)
     center = high / 2 + low / 2
     unit = (vertices - center) / half.max()  # near 1 before squares are taken
     farthest = np.linalg.norm(unit[used], axis=1).max()

@@ -1,4 +1,4 @@
-"""The settings by which one mesh becomes signed samples: plain numbers, hashed by the store, filled from YAML."""
+"""How one mesh becomes signed samples: plain numbers, filled from YAML and hashed by the store."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,13 +16,15 @@ class Preparation:
     Args:
         sign: how inside is told from outside. "winding" takes the pseudo-normal on clean closed meshes.
         samples: signed samples of a shape.
-        near_share: share of them near the surface, split evenly over `variances`; the rest is uniform in [-1, 1]^3.
+        near_share: share of them near the surface, split evenly over `variances`; the rest is uniform in
+            [-1, 1]^3.
         variances: squared standard deviations of the jitter, normalised units squared.
         surface_points: oriented surface samples of a shape.
         views: directions, spread over the sphere, from which faces are looked at.
-        hidden_below: a face seen less than this share of what an isolated face of its area would be is dropped.
-        two_sided_above: a face is a two-sided sheet if its less seen side has more than this share of the sightings.
-        drop_uncertain: leave out samples whose sign is uncertain (DeepSDF's rule for the vote: all or nothing).
+        hidden_below: a face is dropped if it is seen less than this share of what it would be in isolation.
+        two_sided_above: a face is a two-sided sheet if its less seen side has more than this share of its
+            sightings.
+        drop_uncertain: leave out samples whose sign is uncertain (DeepSDF's rule: a unanimous vote or none).
         min_faces: triangles in the source.
         min_extent_ratio: smallest side of the bounding box over its largest.
         max_zero_area: share of the triangles without an area.
@@ -32,7 +34,7 @@ class Preparation:
         min_inside: share of the samples that lie inside.
         max_inside: share of the samples that lie inside.
         max_contradictory: share of sightings on the less seen side of their face (sign=vote only).
-        max_bad_faces: share of the visible area with more than a tenth of its sightings there (sign=vote only).
+        max_bad_faces: share of the visible area with over a tenth of its sightings there (sign=vote only).
     """
 
     sign: Literal["winding", "vote", "pseudo_normal"] = "winding"
@@ -58,7 +60,11 @@ class Preparation:
     def __post_init__(self):
         object.__setattr__(self, "variances", tuple(self.variances))  # YAML gives a list
         for name, valid, wanted in (
-            ("sign", self.sign in ("winding", "vote", "pseudo_normal"), "one of winding, vote, pseudo_normal"),
+            (
+                "sign",
+                self.sign in ("winding", "vote", "pseudo_normal"),
+                "one of winding, vote, pseudo_normal",
+            ),
             ("samples", self.samples >= 1, "at least 1"),
             ("near_share", 0 <= self.near_share <= 1, "within [0, 1]"),
             ("variances", len(self.variances) > 0 and min(self.variances) > 0, "positive numbers"),
@@ -67,3 +73,7 @@ class Preparation:
         ):
             if not valid:
                 raise SdfhubError(f"preparation.{name}={getattr(self, name)}: must be {wanted}")
+
+
+DEFAULT = Preparation()
+"""What the paper's pipeline does, with the winding number for the sign."""

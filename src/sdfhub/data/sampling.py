@@ -1,9 +1,10 @@
 """One mesh in, signed samples out."""
 
 import numpy as np
+import trimesh
 
 from sdfhub.data.normalize import face_normals, normalize_mesh
-from sdfhub.data.preparation import Preparation
+from sdfhub.data.preparation import DEFAULT, Preparation
 from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points
 from sdfhub.data.visibility import Surface, closed_surface, points_on_faces, visible_surface
 from sdfhub.errors import RejectedMesh
@@ -13,17 +14,19 @@ PROBES = 2000
 """Samples on which the fast path must agree with the winding number."""
 
 
-def prepare_mesh(mesh, preparation: Preparation = Preparation(), seed: int = 0) -> ShapeSamples:
+def prepare_mesh(
+    mesh: trimesh.Trimesh | tuple[np.ndarray, np.ndarray], preparation: Preparation = DEFAULT, seed: int = 0
+) -> ShapeSamples:
     """Signed distances and oriented surface points of one mesh, however broken, in the normalised frame.
 
-    Distances are exact to the faces that can be seen from outside. Rows come in random order, so any slice is
-    a fair draw. Two-sided sheets count for `sdf`, which is positive on both their sides, and belong to `mesh`;
-    they give no surface points: a field with the same sign on both sides has no outward normal there.
+    Distances are exact to the faces that can be seen from outside. Rows come in random order, so any slice
+    is a fair draw. Two-sided sheets count for `sdf`, which is positive on both their sides, and belong to
+    `mesh`; they give no surface points: a field with one sign on both sides has no outward normal there.
 
     Source: DeepSDF (Park et al. 2019), section 5.
 
     Args:
-        mesh: a `trimesh.Trimesh`, or vertices [V, 3] and faces [F, 3]; source units.
+        mesh: a mesh, or its vertices [V, 3] and faces [F, 3]; source units.
         preparation: what to sample and what to refuse.
         seed: the same seed gives the same samples.
     Raises:
@@ -80,7 +83,8 @@ def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: 
 def _check_signs(found: dict[str, float], preparation: Preparation) -> None:
     if found["certain"] < preparation.min_certain:
         raise RejectedMesh(
-            "ambiguous_signs", f"{found['certain']:.1%} certain, at least {preparation.min_certain:.0%} wanted"
+            "ambiguous_signs",
+            f"{found['certain']:.1%} certain, at least {preparation.min_certain:.0%} wanted",
         )
     low, high = preparation.min_inside, preparation.max_inside
     if not low <= found["inside"] <= high:
@@ -105,9 +109,7 @@ def _area_weighted(
     return points_on_faces(vertices[faces], face, rng), normals[face] / area[face, None]
 
 
-def _oriented_points(
-    surface: Surface, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3))
     return _area_weighted(surface.vertices, surface.solid(), count, rng)

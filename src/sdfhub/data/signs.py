@@ -4,11 +4,8 @@ libigl's own signed distance by fast winding number returns wrong magnitudes, so
 are computed apart and combined by the caller.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-
-os.environ.setdefault("IGL_NUM_THREADS", "1")  # read once by libigl; shapes run in parallel, not points
 
 import igl
 import numpy as np
@@ -91,9 +88,9 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
 
     Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds.
 
-    No face crosses the ball around a point whose radius is its distance, so the sign seldom changes within it.
-    The number is computed for the centres of such balls only, from large cells to small ones, and handed to the
-    other points of the ball when it is clearly 0 or 1 (near a hole it is not).
+    No face crosses the ball around a point whose radius is its distance, so the sign rarely changes in it.
+    The number is computed for the centres of such balls only, from large cells to small ones, and handed to
+    the other points of the ball when it is clearly 0 or 1 (near a hole it is not).
     """
     order = morton_order(points)
     points, distance = points[order], nearest.distance[order]
@@ -128,7 +125,7 @@ def _largest_of_runs(keys: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, n
 
 
 def vote_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator) -> Signs:
-    """Inside where most of the nearest visible points are seen from behind; certain if all of them agree.
+    """Inside where most of the nearest visible points face away; certain if all of them agree.
 
     Source: DeepSDF (Park et al. 2019), section 5, with 11 votes as in its code.
     """
@@ -136,7 +133,9 @@ def vote_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.r
     area = np.linalg.norm(normals, axis=1)
     face = rng.choice(len(area), VOTERS, p=area / area.sum())
     voters = points_on_faces(surface.vertices[surface.faces], face, rng)
-    turned = np.where(surface.two_sided[face] & (rng.random(VOTERS) < 0.5), -1.0, 1.0)  # seen from either side
+    turned = np.where(
+        surface.two_sided[face] & (rng.random(VOTERS) < 0.5), -1.0, 1.0
+    )  # seen from either side
     normal = normals[face] * turned[:, None]
     order = morton_order(voters)
     voters, normal = voters[order], normal[order]
@@ -149,14 +148,24 @@ def vote_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.r
 def pseudo_normal_signs(
     points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator
 ) -> Signs:
-    """Inside where the angle-weighted normal at the nearest point looks away; exact on clean closed meshes only.
+    """Inside where the angle-weighted normal at the nearest point looks away; for clean closed meshes only.
 
     Source: Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal.
     """
-    *_, normals = igl.signed_distance(
-        points, surface.vertices, surface.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    )
-    inside = np.einsum("nj,nj->n", points - nearest.foot, normals) < 0
+    corners, foot = surface.vertices[surface.faces], nearest.foot
+    normals = face_normals(surface.vertices, surface.faces)
+    share = np.ones(len(points))  # smallest barycentric coordinate of the foot
+    for i in range(3):
+        a, b = corners[nearest.face, i], corners[nearest.face, (i + 1) % 3]
+        part = np.einsum("nj,nj->n", np.cross(b - a, foot - a), normals[nearest.face])
+        share = np.minimum(share, part / np.sum(normals**2, axis=1)[nearest.face])
+    inside = np.einsum("nj,nj->n", points - foot, normals[nearest.face]) < 0
+    edge = share < 1e-6  # elsewhere the face's own normal decides, at no further cost
+    if edge.any():
+        signed, *_ = igl.signed_distance(
+            points[edge], surface.vertices, surface.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        )
+        inside[edge] = signed < 0
     return Signs(inside, np.ones(len(points), bool))
 
 

@@ -33,27 +33,47 @@ def run_name() -> str:
     return "_".join(part for part in parts if part)
 
 
+def register_resolvers() -> None:
+    """Makes `${run_name:}` and `${unique:}` known to the configs."""
+    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+    # two runs that start in one second must not share a folder
+    OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
+
+
 def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     """Composes `config_name` with the command line's overrides and runs `task` on it.
 
-    Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C.
-    HYDRA_FULL_ERROR=1 in the environment shows the traceback of every failure.
+    A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
+    line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
     """
+    failures: list[Exception] = []
     verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints and exits itself, in its own words
-    OmegaConf.register_new_resolver("run_name", run_name, use_cache=True, replace=True)
-    OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
-    if len(sys.argv) > 1 and sys.argv[1] in ("-h", "--help"):
-        os.environ.pop("HYDRA_FULL_ERROR")
+    register_resolvers()
+
+    def guarded(config: DictConfig) -> None:
+        try:
+            task(config)
+        except (SdfhubError, OmegaConfBaseException) as error:
+            if verbose:
+                raise
+            failures.append(error)
+
+    app = hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)(guarded)
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints composition errors itself, in its own words
     try:
-        hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)(task)()
-    except (SdfhubError, HydraException, OmegaConfBaseException) as error:
+        app()
+    except (HydraException, OmegaConfBaseException) as error:
         if verbose:
             raise
-        print(f"sdfhub: error: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        failures.append(error)
     except KeyboardInterrupt:
         sys.exit(130)
+    finally:
+        os.environ["HYDRA_FULL_ERROR"] = str(int(verbose))
+    for error in failures:
+        print(f"sdfhub: error: {one_line(error)}", file=sys.stderr)
+    if failures:
+        sys.exit(2)
 
 
 def one_line(error: Exception) -> str:

@@ -52,7 +52,9 @@ def build(node: Mapping[str, Any], key: str, within: str = "sdfhub", **given: An
     missing = [
         name
         for name, parameter in signature.items()
-        if parameter.default is parameter.empty and name not in arguments | given
+        if parameter.default is parameter.empty
+        and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        and name not in arguments | given
     ]
     if missing:
         raise SdfhubError(f"{key}.{missing[0]}: must be set")

@@ -47,7 +47,7 @@ def prepare_split(source, roles: Split, preparation, data: Mapping[str, Any], pr
         source,
         roles.train + roles.test,
         preparation,
-        root=check(data["root"], str, "data.root"),
+        root=check(data["store"], str, "data.store"),
         workers=check(data["workers"], int | None, "data.workers"),
         progress=progress,
     )

@@ -1,13 +1,15 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from sdfhub.errors import SdfhubError
@@ -35,14 +37,19 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     loader = make_loader(shapes=prepared.train)
     model = build_autodecoder(config, loader.rows)
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
-    trainer = make_trainer(
-        default_root_dir=run,
-        logger=TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        callbacks=[*callbacks.values(), _checkpointing(run)],
-    )
+    logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
+    trainer = _trainer(make_trainer, run, logger, [*callbacks.values(), _checkpointing(run)])
     print(f"run: {run}")
     trainer.fit(model, datamodule=loader, ckpt_path=checkpoint, weights_only=True)
     return evaluate_model(model, dict(enumerate(prepared.train)), prepared.held_out, evaluation, run)
+
+
+def _trainer(make_trainer: Callable[..., Trainer], run: Path, logger, callbacks: list[Callback]) -> Trainer:
+    """The trainer, or one line that says what it cannot do on this machine."""
+    try:
+        return make_trainer(default_root_dir=run, logger=logger, callbacks=callbacks)
+    except (ValueError, TypeError, MisconfigurationException) as error:
+        raise SdfhubError(f"trainer: {error}") from error
 
 
 def _checkpointing(run: Path) -> ModelCheckpoint:

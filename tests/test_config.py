@@ -1,0 +1,171 @@
+"""Every choice composes and builds; every mistake on the command line is one clear line."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks import train as train_task
+from sdfhub.tasks.app import configuration_folder, register_resolvers, run_task
+from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.run import build_autodecoder
+
+CONF = configuration_folder()
+GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
+CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+
+
+def composed(*overrides: str, config_name: str = "config"):
+    register_resolvers()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose(config_name, list(overrides))
+    return plain(config)
+
+
+def parameters(module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def test_every_choice_composes_and_builds(group, choice):
+    config = composed(f"{group}={choice}")
+    build_autodecoder(config, rows=2)
+    build(config["evaluate"], "evaluate")
+    build(config["data"]["preparation"], "data.preparation")
+    build(config["data"]["loader"], "data.loader")
+    build(config["trainer"], "trainer", within="lightning.pytorch")
+    for name, node in config["callbacks"].items():
+        build(node, f"callbacks.{name}")
+    try:
+        build(config["data"]["source"], "data.source")
+    except SdfhubError as error:  # a source whose root is not on this machine says so
+        assert config["data"]["source"].get("root", "?") in str(error)
+
+
+def test_issue_groups_are_all_there():
+    wanted = {
+        "activation": {"relu", "siren", "hosc"},
+        "encoding": {"none", "fourier", "gaussian", "hash"},
+        "normals": {"on", "off"},
+        "category": {"chairs", "lamps", "planes", "sofas", "tables", "all"},
+        "data": {"procedural", "open", "shapenet", "folder", "deepsdf"},
+        "decoder": {"small", "paper_585k", "deepsdf"},
+        "experiment": {"deepsdf", "siren", "fft_siren", "fft_hosc", "hash_siren"},
+        "scale": {"demo", "cpu", "paper"},
+        "trainer": {"auto", "cpu", "gpu", "ddp"},
+    }
+    for group, names in wanted.items():
+        assert names <= {choice for owner, choice in CHOICES if owner == group}
+
+
+def test_deepsdf_preset_has_its_published_size_and_recipe():
+    config = composed("experiment=deepsdf", "scale=paper")
+    assert parameters(build_autodecoder(config, rows=1).decoder) == 1_843_195
+    assert (config["optim"]["lr_decoder"], config["optim"]["lr_codes"]) == (5e-4, 1e-3)
+    assert config["trainer"]["max_epochs"] == 2000
+    assert config["codes"]["max_norm"] == 1.0
+    assert config["loss"]["code_norm"] == "l2"
+    assert config["loss"]["tau"] == 0
+    loader = config["data"]["loader"]
+    assert (loader["shapes_per_step"], loader["samples_per_shape"], loader["passes_per_epoch"]) == (64, 16384, 1)
+
+
+@pytest.mark.parametrize("experiment", ["fft_siren", "fft_hosc"])
+def test_paper_scale_has_a_third_of_deepsdfs_parameters(experiment):
+    decoder = build_autodecoder(composed(f"experiment={experiment}", "scale=paper"), rows=1).decoder
+    assert abs(parameters(decoder) / 585_073 - 1) < 1e-3
+
+
+def test_evaluation_recipe_is_the_papers():
+    evaluation = build(composed()["evaluate"], "evaluate")
+    assert evaluation.points == 30_000
+    assert (evaluation.fit.steps, evaluation.fit.lr, evaluation.fit.samples) == (800, 5e-3, 8000)
+
+
+def test_normals_off_asks_for_no_surface_points():
+    config = composed("normals=off")
+    assert config["data"]["loader"]["surface_per_shape"] == 0
+    assert config["loss"]["tau"] == 0
+
+
+MISTAKES = {
+    "activation=hosk": ["hosk", "hosc", "siren"],
+    "activaton=hosc": ["activaton"],
+    "activation.betta=3": ["betta"],
+    "activation.beta=abc": ["activation.beta", "abc"],
+    "activation.beta=-1": ["beta", "positive"],
+    "optim.lr_decoder=fast": ["optim.lr_decoder", "fast"],
+    "data.shapes=many": ["data.shapes", "many"],
+    "data.shapes=-4": ["negative"],
+    "data.preparation.sign=guess": ["data.preparation.sign", "guess"],
+    "data.preparation.samples=1.5": ["data.preparation.samples"],
+    "trainer.max_epochs=ten": ["trainer.max_epochs", "ten"],
+    "trainer.accelerator=quantum": ["quantum"],
+    "seed=x": ["seed"],
+    "ckpt_path=nowhere.ckpt": ["nowhere.ckpt"],
+    "data=folder": ["data/meshes"],
+    "data=shapenet": ["data/shapenet"],
+    "data=deepsdf": ["data/deepsdf"],
+    "decoder.width=0": ["decoder", "width"],
+    "encoding.frequencies=0": ["frequencies"],
+    "codes._target_=os.system": ["codes._target_", "os.system"],
+    "decoder._target_=subprocess.Popen": ["decoder._target_"],
+    "evaluate.resolution=1": ["resolution"],
+    "loss.delta=0": ["delta"],
+    "callbacks.mesh.shapes=0": ["shapes"],
+}
+
+
+@pytest.mark.parametrize("override", MISTAKES)
+def test_a_mistake_is_one_line_that_names_it(override, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", override])
+    with pytest.raises(SystemExit) as stop:
+        train_task.main()
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert stop.value.code == 2
+    assert message.startswith("sdfhub: error: ")
+    assert "Traceback" not in message
+    for word in MISTAKES[override]:
+        assert word in message
+
+
+def test_ctrl_c_is_status_130(monkeypatch, tmp_path):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    with pytest.raises(SystemExit) as stop:
+        run_task(interrupted, "config")
+    assert stop.value.code == 130
+
+
+def test_build_imports_nothing_outside_its_package(tmp_path, monkeypatch):
+    (tmp_path / "canary.py").write_text("raise SystemExit('a stranger ran')\nclass Canary: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SdfhubError, match="not a class of"):
+        build({"_target_": "canary.Canary"}, "decoder", within="sdfhub.model")
+    with pytest.raises(SdfhubError, match="there is no|not a class of"):
+        build({"_target_": "sdfhub.model.decoder.nn.Linear"}, "decoder", within="sdfhub.model")
+
+
+def test_check_takes_what_means_the_same_and_refuses_the_rest():
+    assert check(2, float, "key") == 2.0
+    assert check(None, int | None, "key") is None
+    for value, hint in (("abc", float), (1.5, int), ("yes please", bool)):
+        with pytest.raises(SdfhubError, match="^key="):
+            check(value, hint, "key")
+
+
+def test_no_yaml_is_left_out_of_its_group():
+    for path in CONF.rglob("*.yaml"):
+        assert OmegaConf.load(path) is not None
+        assert path.parent in (CONF, *(CONF / group for group in GROUPS)), path
+
+
+def test_train_script_is_short():
+    assert len((Path(__file__).parents[1] / "train.py").read_text().splitlines()) <= 15
