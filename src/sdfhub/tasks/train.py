@@ -7,7 +7,6 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
@@ -15,6 +14,7 @@ from omegaconf import DictConfig
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import evaluate_model
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder
@@ -29,6 +29,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     checkpoint = _existing_checkpoint(check(config["ckpt_path"], str | None, "ckpt_path"))
     evaluation = build(config["evaluate"], "evaluate")
     callbacks = {name: build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()}
+    every = {key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()}
+    checkpoints = checkpointing(run / "checkpoints", **every)
     make_trainer = build(config["trainer"], "trainer", within="lightning.pytorch")
     make_loader = build(config["data"]["loader"], "data.loader")
     build_autodecoder(config, rows=1)
@@ -38,7 +40,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     model = build_autodecoder(config, loader.rows)
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
-    trainer = _trainer(make_trainer, run, logger, [*callbacks.values(), _checkpointing(run)])
+    trainer = _trainer(make_trainer, run, logger, [*callbacks.values(), *checkpoints])
     print(f"run: {run}")
     trainer.fit(model, datamodule=loader, ckpt_path=checkpoint, weights_only=True)
     return evaluate_model(model, dict(enumerate(prepared.train)), prepared.held_out, evaluation, run)
@@ -47,14 +49,9 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
 def _trainer(make_trainer: Callable[..., Trainer], run: Path, logger, callbacks: list[Callback]) -> Trainer:
     """The trainer, or one line that says what it cannot do on this machine."""
     try:
-        return make_trainer(default_root_dir=run, logger=logger, callbacks=callbacks)
+        return make_trainer(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
     except (ValueError, TypeError, MisconfigurationException) as error:
         raise SdfhubError(f"trainer: {error}") from error
-
-
-def _checkpointing(run: Path) -> ModelCheckpoint:
-    """The newest state after every epoch; an epoch is a whole number of passes, so a resume is exact."""
-    return ModelCheckpoint(run / "checkpoints", filename="last", save_top_k=1, enable_version_counter=False)
 
 
 def _existing_checkpoint(path: str | None) -> str | None:

@@ -1,0 +1,301 @@
+"""The product as a user runs it: the scripts in subprocesses, meshes in, a Chamfer table out."""
+
+import csv
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import lightning as L
+import pytest
+import torch
+import yaml
+
+from sdfhub.data.procedural import generate
+from sdfhub.geometry.metrics import chamfer, sample_surface
+from sdfhub.tasks.evaluate import evaluate_run
+from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
+from tests.test_config import composed
+
+ROOT = Path(__file__).parents[1]
+OPEN = ROOT / "data" / "open"
+TINY = [
+    "scale=demo",
+    "data.preparation.samples=4000",
+    "data.preparation.surface_points=2000",
+    "data.loader.samples_per_shape=256",
+    "data.loader.passes_per_epoch=20",
+    "decoder.width=48",
+    "normals.points=32",
+    "evaluate.resolution=48",
+    "evaluate.points=2000",
+    "evaluate.fit.steps=20",
+    "evaluate.fit.samples=500",
+    "trainer.enable_progress_bar=false",
+]
+
+
+def run(script: list[str], *overrides: str, expect: int = 0) -> subprocess.CompletedProcess:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    command = [sys.executable, *script, *overrides]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280)
+    assert done.returncode == expect, done.stdout[-2000:] + done.stderr[-2000:]
+    return done
+
+
+def only_run(output_root: Path) -> Path:
+    (config,) = output_root.glob("*/*/config.yaml")
+    return config.parent
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> tuple[Path, str]:
+    """One run of train.py on procedural chairs, and what it printed."""
+    root = tmp_path_factory.mktemp("trained")
+    done = run(
+        ["train.py"],
+        *TINY,
+        "activation=hosc",
+        "encoding=fourier",
+        "data.shapes=3",
+        "data.held_out=1",
+        "trainer.max_epochs=6",
+        "callbacks.mesh.every_n_epochs=3",
+        "callbacks.mesh.resolution=32",
+        f"data.store={root / 'store'}",
+        f"output_root={root / 'outputs'}",
+    )
+    return only_run(root / "outputs"), done.stdout
+
+
+def test_training_prints_the_table_and_where_everything_is(trained):
+    folder, printed = trained
+    for words in ("3 shapes to train on, 1 held out", "known shapes", "held-out shapes", "median", "TensorBoard"):
+        assert words in printed
+    assert str(folder / "contact_sheet.png") in printed
+
+
+def test_metrics_files_hold_known_and_held_out_shapes_apart(trained):
+    folder, _ = trained
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert [len(metrics[role]["shapes"]) for role in ("known", "held_out")] == [3, 1]
+    assert metrics["known"]["summary"]["failed"] == 0, "every shape has a surface after training"
+    for row in metrics["known"]["shapes"]:
+        assert row["excess"] == pytest.approx(row["cd"] - row["floor"])
+    rows = list(csv.DictReader((folder / "metrics.csv").open()))
+    assert [row["role"] for row in rows] == ["known"] * 3 + ["held_out"]
+    assert float(rows[0]["cd"]) == pytest.approx(metrics["known"]["shapes"][0]["cd"])
+
+
+def test_split_is_written_down_and_disjoint(trained):
+    split = json.loads((trained[0] / "split.json").read_text())
+    assert len(split["train"]) == 3
+    assert not set(split["train"]) & set(split["held_out"])
+
+
+def test_meshes_are_written_in_their_sources_frame(trained):
+    import trimesh
+
+    folder, _ = trained
+    shape = json.loads((folder / "split.json").read_text())["train"][0]
+    category, index = shape.split("/")
+    mesh = trimesh.load_mesh(folder / "meshes" / "known" / f"{shape}.ply")
+    row = json.loads((folder / "metrics.json").read_text())["known"]["shapes"][0]
+    sides = [sample_surface(*pair, 2000, 7)[0] for pair in ((mesh.vertices, mesh.faces), generate(category, int(index)))]
+    assert chamfer(*sides) == pytest.approx(row["cd_source"], rel=0.25)
+
+
+def test_tensorboard_has_every_curve_picture_and_mesh(trained):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(trained[0] / "tensorboard"))
+    events.Reload()
+    wanted = ["loss/sdf", "loss/code", "loss/normal", "loss/total", "lr/decoder", "lr/codes", "codes/norm"]
+    wanted += ["beta/layer_0", "omega/layer_0", "speed/samples_per_second", "surface/cd", "surface/failed"]
+    assert set(wanted) <= set(events.Tags()["scalars"])
+    assert any("slice" in tag for tag in events.Tags()["images"])
+    tensors = events.Tags()["tensors"]
+    assert any("truth" in tag for tag in tensors)
+    assert any("reconstruction" in tag for tag in tensors)
+
+
+def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(trained):
+    folder, _ = trained
+    done = run(
+        ["-m", "sdfhub.tasks.command", "evaluate"],
+        f"run={folder}",
+        "evaluate=fast",
+        "evaluate.resolution=40",
+        "evaluate.points=2000",
+        "evaluate.fit.steps=10",
+        "held_out=2",
+        "data.store=" + str(folder.parents[2] / "store"),
+    )
+    assert "held-out shapes" in done.stdout
+    metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
+    assert metrics["evaluation"]["resolution"] == 40
+    assert len(metrics["held_out"]["shapes"]) == 2
+    first = json.loads((folder / "metrics.json").read_text())
+    assert metrics["known"]["shapes"][0]["id"] == first["known"]["shapes"][0]["id"]
+
+
+def test_loading_runs_no_code_of_a_strangers_checkpoint(trained, tmp_path):
+    folder, _ = trained
+    config, _ = read_run(folder)
+    canary = tmp_path / "canary"
+
+    class Stranger:
+        def __reduce__(self):
+            return os.system, (f"touch {canary}",)
+
+    (tmp_path / "checkpoints").mkdir()
+    torch.save({"state_dict": Stranger()}, tmp_path / "checkpoints" / "last.ckpt")
+    with pytest.raises(Exception, match="not a readable checkpoint"):
+        load_autodecoder(tmp_path, config)
+    assert not canary.exists()
+    assert load_autodecoder(folder, config).codes.table.shape[0] == 3
+
+
+def test_evaluate_without_a_run_says_so(tmp_path):
+    with pytest.raises(Exception, match="not a run's folder"):
+        evaluate_run(composed("run=" + str(tmp_path), config_name="evaluate"))
+
+
+def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
+    """Bit for bit on the CPU, with dropout, and with another number of loader processes."""
+    common = [
+        *TINY,
+        "data.shapes=3",
+        "data.held_out=0",
+        "decoder.dropout=0.1",
+        "data.loader.passes_per_epoch=4",
+        "data.loader.shapes_per_step=2",
+        f"data.store={tmp_path / 'store'}",
+        "callbacks=none",
+        "evaluate.known=0",
+        "optim=step",
+        "trainer=cpu",
+        "trainer.max_epochs=4",
+    ]
+    run(["train.py"], *common, "checkpoint.snapshot_every_n_epochs=1", f"output_root={tmp_path / 'whole'}")
+    whole = only_run(tmp_path / "whole") / "checkpoints"
+    half = whole / "epoch_0001.ckpt"
+    run(
+        ["train.py"],
+        *common,
+        f"ckpt_path={half}",
+        "data.loader.workers=1",
+        f"output_root={tmp_path / 'rest'}",
+    )
+    rest = only_run(tmp_path / "rest") / "checkpoints"
+    states = [torch.load(path / "last.ckpt", weights_only=True) for path in (whole, rest)]
+    assert torch.load(half, weights_only=True)["global_step"] == 8 // 2 * 1
+    assert states[0]["global_step"] == states[1]["global_step"]
+    for name, value in states[0]["state_dict"].items():
+        assert torch.equal(value, states[1]["state_dict"][name]), name
+
+
+COMBINATIONS = list(
+    itertools.product(["relu", "siren", "hosc"], ["none", "fourier", "gaussian", "hash"], ["on", "off"])
+)
+
+
+@pytest.fixture(scope="module")
+def ball_batches():
+    from tests.test_training import batches
+
+    return batches(shapes=4, per_step=4, samples=256, surface=64)
+
+
+@pytest.mark.parametrize(("activation", "encoding", "normals"), COMBINATIONS)
+def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
+    config = composed(f"activation={activation}", f"encoding={encoding}", f"normals={normals}")
+    module = build_autodecoder(config, rows=4)
+    config["trainer"]["max_epochs"] = 1
+    losses = []
+
+    class Keep(L.Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            losses.append(float(outputs["loss"]))
+
+    trainer = L.Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        limit_train_batches=30,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        callbacks=[Keep()],
+    )
+    steps = torch.utils.data.DataLoader(ball_batches, sampler=range(30), batch_size=None)
+    trainer.fit(module, steps)
+    assert all(torch.isfinite(torch.tensor(losses)))
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+
+
+def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path):
+    done = run(
+        ["train.py"],
+        *TINY,
+        "data.shapes=2",
+        "data.held_out=0",
+        "optim.lr_decoder=1e30",
+        "activation=relu",
+        "callbacks=none",
+        f"data.store={tmp_path / 'store'}",
+        f"output_root={tmp_path / 'outputs'}",
+        expect=2,
+    )
+    assert "Traceback" not in done.stderr
+    message = done.stderr.strip().splitlines()[-1]
+    assert "not finite at step" in message
+    assert "lower optim.lr_decoder" in message
+
+
+def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_path):
+    import trimesh
+
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for index in range(3):
+        vertices, faces = generate("chairs", index)
+        trimesh.Trimesh(vertices, faces).export(meshes / f"chair_{index}.obj")
+    (meshes / "broken.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    done = run(
+        ["-m", "sdfhub.tasks.command", "prepare"],
+        "data=folder",
+        f"data.source.root={meshes}",
+        "data.shapes=4",
+        "data.held_out=0",
+        "data.preparation.samples=2000",
+        f"data.store={tmp_path / 'store'}",
+    )
+    assert "3 shapes kept, 1 rejected" in done.stdout
+    assert "broken" in done.stdout
+
+
+@pytest.mark.skipif(not OPEN.is_dir(), reason="data/open is not there; `make data` fetches it")
+def test_real_furniture_trains_to_a_table(tmp_path):
+    run(
+        ["train.py"],
+        *TINY,
+        "data=open",
+        "category=chairs",
+        "data.shapes=3",
+        "data.held_out=1",
+        "trainer.max_epochs=6",
+        "callbacks=none",
+        f"data.store={tmp_path / 'store'}",
+        f"output_root={tmp_path / 'outputs'}",
+    )
+    folder = only_run(tmp_path / "outputs")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert len(metrics["known"]["shapes"]) >= 2
+    manifest = json.loads(next((tmp_path / "store").rglob("manifest.json")).read_text())
+    assert manifest["credits"][0]["licence"]
+    assert yaml.safe_load((folder / "config.yaml").read_text())["data"]["source"]["root"] == "data/open"
