@@ -43,16 +43,11 @@ def test_overlapping_parts_count_as_their_union():
     assert error < 0.002
 
 
-def test_vote_agrees_with_the_truth_on_a_clean_shape():
-    right, _ = errors(prepare_mesh(CHAIR, Preparation(sign="vote", samples=20_000, surface_points=0)), CHAIR)
-    assert right >= 0.97
-
-
-def test_dropping_uncertain_votes_raises_their_accuracy():
+def test_votes_are_mostly_right_and_the_unanimous_ones_more_so():
     kept = prepare_mesh(CHAIR, Preparation(sign="vote", samples=20_000))
     dropped = prepare_mesh(CHAIR, Preparation(sign="vote", samples=20_000, drop_uncertain=True))
     assert len(dropped.points) < len(kept.points)
-    assert errors(dropped, CHAIR)[0] > errors(kept, CHAIR)[0]
+    assert errors(dropped, CHAIR)[0] > errors(kept, CHAIR)[0] >= 0.97
 
 
 def test_fast_path_is_taken_on_clean_meshes_only():
@@ -182,10 +177,9 @@ def test_too_many_pieces_are_rejected():
 def test_a_half_open_shape_is_ambiguous():
     vertices, faces = triangles(refined(Manifold.sphere(1, 64), 0.1))
     random_half = np.random.default_rng(0).random(len(faces)) < 0.35
-    loose = Preparation(samples=20_000, max_two_sided_area=1)
-    with pytest.raises(RejectedMesh) as caught:
+    loose = Preparation(samples=20_000, two_sided_above=0.5)  # nothing is a sheet
+    with pytest.raises(RejectedMesh, match="ambiguous_signs"):
         prepare_mesh((vertices, faces[random_half]), loose)
-    assert caught.value.reason in ("ambiguous_signs", "inside_fraction")
 
 
 def test_vote_refuses_what_deepsdf_would():

@@ -165,8 +165,8 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
 def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarray) -> np.ndarray:
     """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it.
 
-    A wall seen from within through a hole looks two-sided; behind it the number is nearly 1. Behind a sheet it
-    is about 1/2, before it -1/2.
+    A wall seen from within through a hole looks two-sided, but behind it the number is nearly 1. Behind a
+    sheet it is about 1/2, before it -1/2.
     """
     normals = face_normals(vertices, suspects)
     step = STEP * normals / np.linalg.norm(normals, axis=1)[:, None]

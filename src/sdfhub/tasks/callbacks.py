@@ -1,5 +1,8 @@
 """What training shows of itself while it runs: meshes, slices and Chamfer distances in TensorBoard."""
 
+import time
+from collections import deque
+
 import fast_simplification
 import lightning as L
 import numpy as np
@@ -15,6 +18,40 @@ from sdfhub.tasks.evaluate import reconstruct
 
 TENSORBOARD_VERTICES = 60_000
 """TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""
+
+
+class TrainingRecord(L.Callback):
+    """Seconds, steps and the loss at both ends of a training, for `metrics.json`."""
+
+    ENDS = 20
+    """Steps averaged at either end."""
+
+    def __init__(self):
+        self._first: list[float] = []
+        self._last: deque[float] = deque(maxlen=self.ENDS)
+        self._seconds = 0.0
+
+    def on_train_start(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+        self._started = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
+        loss = float(outputs["loss"])
+        self._last.append(loss)
+        if len(self._first) < self.ENDS:
+            self._first.append(loss)
+
+    def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+        self._seconds = time.perf_counter() - self._started
+
+    def summary(self, model: AutoDecoder) -> dict:
+        """Plain numbers: seconds of this process, optimiser steps of the whole run, parameters, loss."""
+        mean = {"start": np.mean(self._first), "end": np.mean(self._last)} if self._last else {}
+        return {
+            "seconds": self._seconds,
+            "steps": model.global_step,
+            "parameters": sum(parameter.numel() for parameter in model.decoder.parameters()),
+            "loss": {key: float(value) for key, value in mean.items()},
+        }
 
 
 class MeshShapes(L.Callback):

@@ -69,6 +69,7 @@ def evaluate_model(
     held_out: Sequence[StoredShape],
     evaluation: Evaluation,
     out: Path,
+    training: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Judges known and held-out shapes; writes what it found below `out` and prints the table.
 
@@ -80,6 +81,7 @@ def evaluate_model(
         held_out: shapes that it has not seen.
         evaluation: how to judge.
         out: folder of the results.
+        training: plain numbers about the training, to be kept beside the scores.
 
     Returns:
         What `metrics.json` holds.
@@ -93,9 +95,9 @@ def evaluate_model(
         roles += [("held_out", shape, code) for shape, code in zip(unseen, codes, strict=True)]
     if any(shape.mesh is None for _, shape, _ in roles):
         rows = [(role, shape, distance_errors(model.decoder, code, shape)) for role, shape, code in roles]
-        return write_distances(rows, out)
+        return write_distances(rows, training, out)
     bar = tqdm(roles, desc="judging", unit="shape", leave=False)
-    return write_scores([_judge(*row, model.decoder, evaluation) for row in bar], evaluation, out)
+    return write_scores([_judge(*row, model.decoder, evaluation) for row in bar], evaluation, training, out)
 
 
 def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:

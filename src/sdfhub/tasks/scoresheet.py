@@ -40,18 +40,21 @@ class Judged:
     faces: np.ndarray
 
 
-def write_scores(judged: Sequence[Judged], evaluation: Any, out: Path) -> dict[str, Any]:
+def write_scores(
+    judged: Sequence[Judged], evaluation: Any, training: dict[str, Any] | None, out: Path
+) -> dict[str, Any]:
     """Writes `metrics.json`, `metrics.csv`, `meshes/` and `contact_sheet.png` below `out`; prints the table.
 
     Args:
         judged: what was judged, in the order of the table.
         evaluation: a dataclass of the settings, kept beside the numbers.
+        training: plain numbers about the training, likewise; None where nothing was trained.
         out: folder of the results.
 
     Returns:
         What `metrics.json` holds: the settings and, per role, a `summary` and the rows of its `shapes`.
     """
-    result: dict[str, Any] = {"evaluation": dataclasses.asdict(evaluation)}
+    result: dict[str, Any] = {"evaluation": dataclasses.asdict(evaluation), "training": training}
     for role in dict.fromkeys(row.role for row in judged):
         rows = [row for row in judged if row.role == role]
         shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
@@ -126,20 +129,23 @@ def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
     contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
 
 
-def write_distances(rows: Sequence[tuple[str, StoredShape, dict[str, float]]], out: Path) -> dict[str, Any]:
+def write_distances(
+    rows: Sequence[tuple[str, StoredShape, dict[str, float]]], training: dict[str, Any] | None, out: Path
+) -> dict[str, Any]:
     """The scores of shapes without a mesh: `metrics.json`, `metrics.csv` and a printed table.
 
     Args:
-        rows: role, shape and its distance errors.
+        rows: role, shape and its distance errors; at least one.
+        training: plain numbers about the training; None where nothing was trained.
         out: folder of the results.
     """
-    result: dict[str, Any] = {}
+    result: dict[str, Any] = {"training": training}
     lines, heads = [["role", "id", *rows[0][2]]], list(rows[0][2])
     for role, shape, errors in rows:
         entry = result.setdefault(role, {"summary": {}, "shapes": []})
         entry["shapes"].append({"id": shape.id, **errors})
         lines.append([role, shape.id, *errors.values()])
-    for entry in result.values():
+    for entry in (result[role] for role in dict.fromkeys(row[0] for row in rows)):
         for head in heads:
             values = [row[head] for row in entry["shapes"]]
             entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}

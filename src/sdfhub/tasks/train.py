@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,53 +12,85 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
+from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
-from sdfhub.tasks.evaluate import evaluate_model
+from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder
 
 
+@dataclass(frozen=True)
+class Parts:
+    """What a config describes, built and so checked before the first shape is prepared."""
+
+    evaluation: Evaluation
+    callbacks: list[Callback]
+    make_loader: Callable[..., SdfDataModule]
+    make_trainer: Callable[..., Trainer]
+    resume_from: str | None
+
+
 def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Trains what a plain config describes into the folder `run`; returns the evaluation's summary.
+    """Trains what a plain config describes into the folder `run`.
 
-    Every part is built, and so checked, before the first shape is prepared.
+    Returns:
+        What `metrics.json` holds; empty in processes of a distributed run that are not the first.
     """
-    config["seed"] = check(config["seed"], int, "seed")
-    checkpoint = _existing_checkpoint(check(config["ckpt_path"], str | None, "ckpt_path"))
-    evaluation = build(config["evaluate"], "evaluate")
-    callbacks = {name: build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()}
-    every = {key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()}
-    checkpoints = checkpointing(run / "checkpoints", **every)
-    make_trainer = build(config["trainer"], "trainer", within="lightning.pytorch")
-    make_loader = build(config["data"]["loader"], "data.loader")
-    build_autodecoder(config, rows=1)
-
+    parts = build_parts(config, run)
     prepared = prepare_data(config["data"])
-    loader = make_loader(shapes=prepared.train)
+    loader = parts.make_loader(shapes=prepared.train)
     model = build_autodecoder(config, loader.rows)
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
-    logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
-    trainer = _trainer(make_trainer, run, logger, [*callbacks.values(), *checkpoints])
-    print(f"run: {run}")
-    trainer.fit(model, datamodule=loader, ckpt_path=checkpoint, weights_only=True)
-    return evaluate_model(model, dict(enumerate(prepared.train)), prepared.held_out, evaluation, run)
+    record = TrainingRecord()
+    trainer = _trainer(parts, run, record)
+    print(f"run: {run}", flush=True)
+    trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if not trainer.is_global_zero:
+        return {}
+    known = dict(enumerate(prepared.train))
+    return evaluate_model(model, known, prepared.held_out, parts.evaluation, run, record.summary(model))
 
 
-def _trainer(make_trainer: Callable[..., Trainer], run: Path, logger, callbacks: list[Callback]) -> Trainer:
+def build_parts(config: dict[str, Any], run: Path) -> Parts:
+    """The parts of a training run.
+
+    Raises:
+        SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
+    """
+    config["seed"] = check(config["seed"], int, "seed")
+    resume_from = check(config["ckpt_path"], str | None, "ckpt_path")
+    if resume_from is not None and not Path(resume_from).is_file():
+        raise SdfhubError(f"ckpt_path={resume_from}: there is no such file; a run keeps checkpoints/last.ckpt")
+    every = {key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()}
+    callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
+    build_autodecoder(config, rows=1)
+    return Parts(
+        evaluation=build(config["evaluate"], "evaluate"),
+        callbacks=[*callbacks, *checkpointing(run / "checkpoints", **every)],
+        make_loader=build(config["data"]["loader"], "data.loader"),
+        make_trainer=build(config["trainer"], "trainer", within="lightning.pytorch"),
+        resume_from=resume_from,
+    )
+
+
+def _trainer(parts: Parts, run: Path, record: TrainingRecord) -> Trainer:
     """The trainer, or one line that says what it cannot do on this machine."""
+    logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     try:
-        return make_trainer(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
+        return parts.make_trainer(
+            default_root_dir=run,
+            logger=logger,
+            callbacks=[*parts.callbacks, record],
+            plugins=WholeFileIO(),
+        )
     except (ValueError, TypeError, MisconfigurationException) as error:
         raise SdfhubError(f"trainer: {error}") from error
-
-
-def _existing_checkpoint(path: str | None) -> str | None:
-    if path is not None and not Path(path).is_file():
-        raise SdfhubError(f"ckpt_path={path}: there is no such file; a run keeps checkpoints/last.ckpt")
-    return path
 
 
 def main() -> None:

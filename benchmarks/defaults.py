@@ -1,0 +1,31 @@
+"""The defaults at scale=cpu against DeepSDF in the same training time, side by side on this machine.
+
+    python benchmarks/defaults.py [more overrides for every run]
+
+Trains fft_hosc and fft_siren as they are; measures an epoch of DeepSDF; trains DeepSDF for as many epochs
+as fit into the longer of the two times. Prints a Markdown table; CD, floor and excess times 10^3.
+"""
+
+import sys
+
+from runs import HEAD, row, train
+
+
+def main(overrides: list[str]) -> None:
+    common = ["scale=cpu", "callbacks=none", *overrides]
+    ours = {name: train(name, *common, f"experiment={name}") for name in ("fft_hosc", "fft_siren")}
+    seconds = max(metrics["training"]["seconds"] for metrics in ours.values())
+    short = train("deepsdf_short", *common, "experiment=deepsdf", "trainer.max_epochs=2", "evaluate.known=1", "data.held_out=0")
+    epochs = max(1, round(seconds / (short["training"]["seconds"] / 2)))
+    rows = ours | {"deepsdf": train("deepsdf", *common, "experiment=deepsdf", f"trainer.max_epochs={epochs}")}
+    for role in ("known", "held_out"):
+        if all(role in metrics for metrics in rows.values()):
+            print(f"\n{role}\n\n{HEAD}")
+            print("\n".join(row(name, metrics, role) for name, metrics in rows.items()), flush=True)
+    excess = {name: metrics["known"]["summary"]["excess"]["mean"] for name, metrics in rows.items()}
+    for name in ours:
+        print(f"deepsdf / {name}, mean excess of known shapes: {excess['deepsdf'] / excess[name]:.1f}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
