@@ -13,7 +13,9 @@ from runs import HEAD, row, train
 
 def main(overrides: list[str]) -> None:
     print(HEAD.replace("seconds |\n", "seconds | loss start | loss end |\n") + " --- | --- |")
-    grid = itertools.product(["relu", "siren", "hosc"], ["none", "fourier", "gaussian", "hash"], ["on", "off"])
+    grid = itertools.product(
+        ["relu", "siren", "hosc"], ["none", "fourier", "gaussian", "hash"], ["on", "off"]
+    )
     for activation, encoding, normals in grid:
         choice = [f"activation={activation}", f"encoding={encoding}", f"normals={normals}"]
         name = f"{activation}_{encoding}_normals-{normals}"

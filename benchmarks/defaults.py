@@ -15,7 +15,14 @@ def main(overrides: list[str]) -> None:
     common = ["scale=cpu", "callbacks=none", *overrides]
     ours = {name: train(name, *common, f"experiment={name}") for name in ("fft_hosc", "fft_siren")}
     seconds = max(metrics["training"]["seconds"] for metrics in ours.values())
-    short = train("deepsdf_short", *common, "experiment=deepsdf", "trainer.max_epochs=2", "evaluate.known=1", "data.held_out=0")
+    short = train(
+        "deepsdf_short",
+        *common,
+        "experiment=deepsdf",
+        "trainer.max_epochs=2",
+        "evaluate.known=1",
+        "data.held_out=0",
+    )
     epochs = max(1, round(seconds / (short["training"]["seconds"] / 2)))
     rows = ours | {"deepsdf": train("deepsdf", *common, "experiment=deepsdf", f"trainer.max_epochs={epochs}")}
     for role in ("known", "held_out"):

@@ -15,7 +15,13 @@ def train(name: str, *overrides: str) -> dict:
         RuntimeError: the run failed; the message is its own last line.
     """
     folder = ROOT / "outputs" / "benchmarks" / name
-    command = [sys.executable, "train.py", *overrides, f"hydra.run.dir={folder}", "trainer.enable_progress_bar=false"]
+    command = [
+        sys.executable,
+        "train.py",
+        *overrides,
+        f"hydra.run.dir={folder}",
+        "trainer.enable_progress_bar=false",
+    ]
     done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
     if done.returncode:
         raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
@@ -28,13 +34,24 @@ def row(name: str, metrics: dict, role: str = "known") -> str:
     if summary["cd"]["mean"] is None:
         cells = ["no surface"] + [""] * 4
     else:
-        pairs = [("cd", "mean"), ("cd", "median"), ("floor", "mean"), ("excess", "mean"), ("excess", "median")]
+        pairs = [
+            ("cd", "mean"),
+            ("cd", "median"),
+            ("floor", "mean"),
+            ("excess", "mean"),
+            ("excess", "median"),
+        ]
         cells = [f"{summary[key][statistic] * 1e3:.4f}" for key, statistic in pairs]
-    counts = [f"{summary['failed']}/{summary['shapes']}", f"{training['parameters']:,}", f"{training['seconds']:.0f}"]
+    counts = [
+        f"{summary['failed']}/{summary['shapes']}",
+        f"{training['parameters']:,}",
+        f"{training['seconds']:.0f}",
+    ]
     return f"| {name} | " + " | ".join(cells + counts) + " |"
 
 
 HEAD = (
-    "| run | CD mean | CD median | floor | excess mean | excess median | no surface | parameters | seconds |\n"
+    "| run | CD mean | CD median | floor | excess mean | excess median | no surface | parameters "
+    "| seconds |\n"
     "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )

@@ -67,7 +67,7 @@ def test_frequencies_and_sharpness_must_be_positive(settings):
 
 
 def test_siren_initialisation_keeps_unit_scale_through_depth():
-    """Sitzmann et al. 2020, theorem 1.8, exactly: a Gaussian of variance s leaves sine and the next layer with
+    """Sitzmann et al. 2020, theorem 1.8: a Gaussian of variance s leaves sine and the next layer with
     variance 2 E[sin^2] = 1 - exp(-2 s), whose fixed point is s = 0.797."""
     torch.manual_seed(0)
     hidden = torch.randn(2000, 256).clamp(-1, 1)

@@ -100,7 +100,10 @@ def test_cosine_schedule_rises_then_falls_to_its_end():
 def test_each_group_has_its_own_learning_rate():
     decoder, codes = torch.nn.Parameter(torch.ones(2)), torch.nn.Parameter(torch.ones(2))
     optimizer, _ = Adam(1e-3, 1e-2, Constant()).configure([decoder], [codes], steps=10)
-    assert {group["name"]: group["lr"] for group in optimizer.param_groups} == {"decoder": 1e-3, "codes": 1e-2}
+    assert {group["name"]: group["lr"] for group in optimizer.param_groups} == {
+        "decoder": 1e-3,
+        "codes": 1e-2,
+    }
 
 
 def test_wrapping_slice_reaches_every_row_equally():

@@ -80,7 +80,7 @@ class StepBatches(Dataset):
         """Keeps, of every batch, the part of process `rank` of `world`."""
         if self.shapes_per_step % world:
             raise SdfhubError(
-                f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared evenly by {world} processes; "
+                f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared by {world} processes; "
                 f"choose a multiple of {world}"
             )
         self.rank, self.world = rank, world

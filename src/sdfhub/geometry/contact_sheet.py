@@ -19,7 +19,7 @@ def contact_sheet(
     """Lays pictures out as a grid and writes it as one PNG, whole or not at all.
 
     Args:
-        rows: pictures [S, S, 3] uint8 of one size; None is a shape without a surface and gets a tile that says so.
+        rows: pictures [S, S, 3] uint8 of one size; None (no surface) gets a tile that says so.
         row_labels: one text per row; [] for none.
         column_captions: one text per column, written below the header line; [] for none.
         path: where the PNG goes; its folder is made.

@@ -63,7 +63,7 @@ def render(
 
 
 def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
-    """A signed distance slice in colour: blue inside, orange outside, iso-lines every delta / 4, zero in black.
+    """A signed distance slice in colour: blue inside, orange outside, a line every delta / 4, zero black.
 
     Args:
         sdf_grid: [R, R], negative inside; the first index runs right, the second up.
@@ -107,7 +107,9 @@ def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndar
 
 def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed and flat unit normals at the hits, both turned towards the camera."""
-    cross = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    cross = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
     of_face = _unit(cross)
     face = hits["primID"][seen]
     flat = of_face[face]

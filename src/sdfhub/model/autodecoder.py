@@ -81,7 +81,9 @@ class AutoDecoder(L.LightningModule):
         )
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor, codes: Tensor) -> None:
-        values = {f"loss/{name}": part.detach() for name, part in parts.items()} | {"loss/total": loss.detach()}
+        values = {f"loss/{name}": part.detach() for name, part in parts.items()} | {
+            "loss/total": loss.detach()
+        }
         values["codes/norm"] = codes.detach().norm(dim=-1).mean()
         for group in self.optimizers().param_groups:
             values[f"lr/{group['name']}"] = group["lr"]

@@ -30,7 +30,7 @@ class Layer(nn.Module):
         self.linear = nn.Linear(sum(self.columns), outputs)
 
     def forward(self, hidden: Tensor | None, encoded: Tensor, codes: Tensor) -> Tensor:
-        """[B, N, outputs] from hidden [B, N, H] (None in the first layer), encoded [B, N, F], codes [B, L]."""
+        """[B, N, outputs] from hidden [B, N, H] (None in layer 0), encoded [B, N, F], codes [B, L]."""
         from_hidden, from_encoding, from_code = self.linear.weight.split(self.columns, dim=1)
         shift = self.linear.bias if not self.columns[2] else F.linear(codes, from_code, self.linear.bias)
         shift = shift if shift.dim() == 1 else shift[:, None, :]
@@ -89,7 +89,9 @@ class Decoder(nn.Module):
         for index in range(depth + 1):
             encoded = encoding.features if index == 0 or index in inject_encoding else 0
             code = code_size if index == 0 or index in inject_code else 0
-            after = encoding.features * (index + 1 in inject_encoding) + code_size * (index + 1 in inject_code)
+            after = encoding.features * (index + 1 in inject_encoding) + code_size * (
+                index + 1 in inject_code
+            )
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import hydra
-import sdfhub
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import sdfhub
 from sdfhub.errors import SdfhubError
 
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
@@ -29,7 +29,9 @@ def configuration_folder() -> Path:
 def run_name() -> str:
     """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
     choices = HydraConfig.get().runtime.choices
-    parts = [f"{group}-{choices[group]}" if group == "normals" else choices.get(group) for group in NAMED_CHOICES]
+    parts = [
+        f"{group}-{choices[group]}" if group == "normals" else choices.get(group) for group in NAMED_CHOICES
+    ]
     return "_".join(part for part in parts if part)
 
 
@@ -58,7 +60,9 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
                 raise
             failures.append(error)
 
-    app = hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)(guarded)
+    app = hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)(
+        guarded
+    )
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints composition errors itself, in its own words
     try:
         app()
@@ -80,5 +84,7 @@ def one_line(error: Exception) -> str:
     """What a user needs of an error message: its first statements and, for a wrong choice, the choices."""
     text = str(error) or type(error).__name__
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [line for line in lines if not re.match(r"(full_key|object_type|reference_type|Set the env)", line)]
+    told = [
+        line for line in lines if not re.match(r"(full_key|object_type|reference_type|Set the env)", line)
+    ]
     return re.sub(r"\s+", " ", " ".join(told))

@@ -39,7 +39,9 @@ def build(node: Mapping[str, Any], key: str, within: str = "sdfhub", **given: An
     signature = inspect.signature(target).parameters
     for name in arguments:
         if name not in signature:
-            raise SdfhubError(f"{key}.{name}: no such setting; {target.__name__} knows {', '.join(signature)}")
+            raise SdfhubError(
+                f"{key}.{name}: no such setting; {target.__name__} knows {', '.join(signature)}"
+            )
     hints = typing.get_type_hints(target.__init__)
     for name, value in arguments.items():
         where = f"{key}.{name}"

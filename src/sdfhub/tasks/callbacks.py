@@ -89,7 +89,9 @@ class MeshShapes(L.Callback):
         finally:
             module.train()
         judged = [row for row in rows if not row.failed]
-        values = {f"surface/{key}": np.mean([getattr(row, key) for row in judged]) for key in self.METRICS if judged}
+        values = {
+            f"surface/{key}": np.mean([getattr(row, key) for row in judged]) for key in self.METRICS if judged
+        }
         values["surface/failed"] = len(rows) - len(judged)
         trainer.logger.log_metrics({key: float(value) for key, value in values.items()}, trainer.global_step)
 
@@ -105,9 +107,13 @@ class MeshShapes(L.Callback):
         if len(faces):
             self._add_mesh(writer, f"{shape.id}/reconstruction", vertices, faces, step)
             sides = [render(truth.vertices, truth.faces), render(vertices, faces)]
-            writer.add_image(f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC")
+            writer.add_image(
+                f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC"
+            )
         grid = sdf_slice(lambda x: module.decoder(x[None], code[None])[0], axis=0, device=code.device)
-        writer.add_image(f"{shape.id}/slice_x0", slice_image(grid, module.loss.delta), step, dataformats="HWC")
+        writer.add_image(
+            f"{shape.id}/slice_x0", slice_image(grid, module.loss.delta), step, dataformats="HWC"
+        )
         return judge((vertices, faces), truth, points=self.points)
 
     @staticmethod

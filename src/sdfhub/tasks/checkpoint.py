@@ -31,7 +31,13 @@ class WholeFileIO(TorchCheckpointIO):
             beside.unlink(missing_ok=True)
 
 
-def checkpointing(folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None) -> list[ModelCheckpoint]:
+class Snapshots(ModelCheckpoint):
+    """Checkpoints that stay. A class of its own: Lightning tells the states of callbacks apart by class."""
+
+
+def checkpointing(
+    folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None
+) -> list[ModelCheckpoint]:
     """`last.ckpt`, the newest state, and on demand snapshots `epoch_0500.ckpt` that stay.
 
     An epoch is a whole number of passes over the shapes, so a run continued from any of them is exact.
@@ -41,11 +47,13 @@ def checkpointing(folder: Path, every_n_epochs: int, snapshot_every_n_epochs: in
         every_n_epochs: how often `last.ckpt` is written, >= 1.
         snapshot_every_n_epochs: how often a snapshot is kept; None keeps none.
     """
-    last = ModelCheckpoint(folder, filename="last", every_n_epochs=every_n_epochs, enable_version_counter=False)
+    last = ModelCheckpoint(
+        folder, filename="last", every_n_epochs=every_n_epochs, enable_version_counter=False
+    )
     if snapshot_every_n_epochs is None:
         return [last]
     name = "epoch_{epoch:04d}"
-    snapshots = ModelCheckpoint(
+    snapshots = Snapshots(
         folder, name, auto_insert_metric_name=False, save_top_k=-1, every_n_epochs=snapshot_every_n_epochs
     )
     return [last, snapshots]

@@ -136,7 +136,9 @@ def reconstruct(decoder: Decoder, code: Tensor, resolution: int) -> tuple[np.nda
 
 
 @torch.inference_mode()
-def distance_errors(decoder: Decoder, code: Tensor, shape: StoredShape, delta: float = 0.1) -> dict[str, float]:
+def distance_errors(
+    decoder: Decoder, code: Tensor, shape: StoredShape, delta: float = 0.1
+) -> dict[str, float]:
     """How far the field is from a shape's own samples, up to 100,000 a side.
 
     Returns:
@@ -162,14 +164,16 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     evaluation = build(config["evaluate"], "evaluate")
     trained, roles_then = read_run(run)
     model = load_autodecoder(run, trained)
-    data = trained["data"] | config["data"]
+    data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
     is_trained_on = data["source"] == trained["data"]["source"]
     roles = choose_shapes(source, roles_then if is_trained_on else {"train": [], "held_out": []}, config)
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     prepared = prepare_split(source, roles, preparation, data)
     known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
-    return evaluate_model(model, known, prepared.held_out, evaluation, Path(out) if out else run / "evaluation")
+    return evaluate_model(
+        model, known, prepared.held_out, evaluation, Path(out) if out else run / "evaluation"
+    )
 
 
 def choose_shapes(source: Source, trained: dict[str, list[str]], config: dict[str, Any]) -> Split:
@@ -193,7 +197,9 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], config: dict[st
         unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).test]
     for id in (*known, *unseen):
         if id not in offered:
-            raise SdfhubError(f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ...")
+            raise SdfhubError(
+                f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
+            )
     return Split([offered[id] for id in known], [offered[id] for id in unseen])
 
 

@@ -41,7 +41,9 @@ def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
     return prepare_split(source, roles, preparation, data, progress)
 
 
-def prepare_split(source, roles: Split, preparation, data: Mapping[str, Any], progress: bool = True) -> Prepared:
+def prepare_split(
+    source, roles: Split, preparation, data: Mapping[str, Any], progress: bool = True
+) -> Prepared:
     """The stored shapes of a given split."""
     store = stores.prepare(
         source,

@@ -1,9 +1,9 @@
 """A run's folder: what training leaves behind and every later task starts from. Plain data only.
 
-    config.yaml       the composed config, interpolations resolved
-    split.json        ids of the shapes by role; training ids in the order of the code table
-    checkpoints/      last.ckpt and its predecessors
-    metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
+config.yaml       the composed config, interpolations resolved
+split.json        ids of the shapes by role; training ids in the order of the code table
+checkpoints/      last.ckpt and its predecessors
+metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What an evaluation found, for readers: the table, `metrics.json`, `metrics.csv`, meshes, the contact sheet."""
+"""What an evaluation found, for readers: table, `metrics.json`, `metrics.csv`, meshes, contact sheet."""
 
 import csv
 import dataclasses
@@ -122,7 +122,9 @@ def _write_mesh(row: Judged, path: Path) -> None:
 
 def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
     """Ground truth above reconstruction, known shapes first."""
-    shown = [row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]]
+    shown = [
+        row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]
+    ]
     truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces) for row in shown]
     ours = [render(row.vertices, row.faces) if len(row.faces) else None for row in shown]
     captions = [f"{row.shape.id} ({row.role.replace('_', ' ')})" for row in shown]

@@ -66,8 +66,12 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     config["seed"] = check(config["seed"], int, "seed")
     resume_from = check(config["ckpt_path"], str | None, "ckpt_path")
     if resume_from is not None and not Path(resume_from).is_file():
-        raise SdfhubError(f"ckpt_path={resume_from}: there is no such file; a run keeps checkpoints/last.ckpt")
-    every = {key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()}
+        raise SdfhubError(
+            f"ckpt_path={resume_from}: there is no such file; a run keeps checkpoints/last.ckpt"
+        )
+    every = {
+        key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
+    }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
     build_autodecoder(config, rows=1)
     return Parts(

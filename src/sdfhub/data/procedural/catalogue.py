@@ -2,14 +2,19 @@
 
 import numpy as np
 
-from sdfhub.data.procedural import chairs
+from sdfhub.data.procedural import chairs, lamps, sofas, tables
 from sdfhub.data.procedural.parameters import draw
 from sdfhub.errors import SdfhubError
 
 VERSION = 1
 """Raised whenever a generator changes what it makes; stores hash it."""
 
-_DESIGNS = {"chairs": (1, chairs.Chair)}  # the code seeds the draw: never reuse or change one
+_DESIGNS = {
+    "chairs": (1, chairs.Chair),
+    "lamps": (2, lamps.Lamp),
+    "sofas": (4, sofas.Sofa),
+    "tables": (5, tables.Table),
+}  # the code seeds the draw: never reuse or change one
 
 CATEGORIES = tuple(_DESIGNS)
 

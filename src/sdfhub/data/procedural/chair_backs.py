@@ -10,7 +10,14 @@ _RAIL = 0.022  # thickness of rails and posts of light backs
 
 def back(chair) -> list[Manifold]:
     """The parts of the chair's backrest, rooted in its seat."""
-    styles = {"slats": _slats, "spindles": _spindles, "ladder": _ladder, "solid": _solid, "hoop": _hoop, "panel": _panel}
+    styles = {
+        "slats": _slats,
+        "spindles": _spindles,
+        "ladder": _ladder,
+        "solid": _solid,
+        "hoop": _hoop,
+        "panel": _panel,
+    }
     return styles[chair.back](chair)
 
 

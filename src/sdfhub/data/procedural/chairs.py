@@ -1,4 +1,4 @@
-"""Chairs: dining, Windsor, ladder-back, bentwood, cantilever, swivel and tulip, from one set of parameters."""
+"""Chairs: dining, Windsor, ladder-back, bentwood, cantilever, swivel, tulip, from one set of parameters."""
 
 from dataclasses import dataclass
 
@@ -96,8 +96,24 @@ class Chair:
         if self.legs == "round":
             return parts.bar(foot, top, 0.5 * w * self.leg_taper, 0.55 * w)
         r, t = 0.56 * w, self.leg_taper
-        profile = [(0.6, 0), (0.75, 0.03), (0.6, 0.07), (0.5, 0.1), (0.62 + 0.2 * t, 0.3), (0.95, 0.5), (0.95, 0.56)]
-        profile += [(0.55, 0.6), (0.9, 0.63), (0.9, 0.65), (0.55, 0.68), (0.95, 0.72), (1.0, 0.76), (1.0, 1.0)]
+        profile = [
+            (0.6, 0),
+            (0.75, 0.03),
+            (0.6, 0.07),
+            (0.5, 0.1),
+            (0.62 + 0.2 * t, 0.3),
+            (0.95, 0.5),
+            (0.95, 0.56),
+        ]
+        profile += [
+            (0.55, 0.6),
+            (0.9, 0.63),
+            (0.9, 0.65),
+            (0.55, 0.68),
+            (0.95, 0.72),
+            (1.0, 0.76),
+            (1.0, 1.0),
+        ]
         return parts.turned(foot, top, [(r * a, h) for a, h in profile])
 
     def _apron(self, tops: list[np.ndarray]) -> list[Manifold]:
@@ -135,7 +151,12 @@ class Chair:
         reach = 0.30 if self.seat == "round" else 0.44
         made = []
         for side in (-1, 1):
-            top = np.array([(side * (self.half_width(y) - 1.5 * r), y, z) for y in self.seat_depth * reach * np.array([-1, 1])])
+            top = np.array(
+                [
+                    (side * (self.half_width(y) - 1.5 * r), y, z)
+                    for y in self.seat_depth * reach * np.array([-1, 1])
+                ]
+            )
             out = np.array([side * 0.4 * self.leg_splay, 0, 0])
             floor = top + out + np.array([[0, -0.5 * self.leg_splay - 0.01, r - z], [0, 0.06, r - z]])
             path = parts.filleted([top[0], floor[0], floor[1], top[1]], 0.05)
@@ -185,6 +206,8 @@ class Chair:
         wide = max(x, behind[0]) + 0.02
         if self.arms == "curved":
             corners = [behind, (wide, 0.3 * y, z + 0.01), (wide, y - 0.05, z - 0.01), seat]
-            return parts.mirrored(parts.tube(parts.filleted(corners, 0.06, 5), 0.4 * self.leg_width, up=(1, 0, 0.2)))
+            return parts.mirrored(
+                parts.tube(parts.filleted(corners, 0.06, 5), 0.4 * self.leg_width, up=(1, 0, 0.2))
+            )
         rest = parts.plank(behind + [0, 0.01, 0], (x, y - 0.05, z), 0.045, 0.024)
         return [*parts.mirrored(rest), *parts.mirrored(parts.square_bar(seat, (x, y, z), 0.03))]

@@ -35,7 +35,9 @@ def rounded_box(size: Sequence[float], centre: Sequence[float], radius: float, s
     half = np.asarray(size, float) / 2
     r = min(radius, 0.98 * half.min())
     theta = np.linspace(0, np.pi / 2, steps + 1)
-    octant = np.array([(np.cos(p) * np.cos(t), np.cos(p) * np.sin(t), np.sin(p)) for p in theta for t in theta])
+    octant = np.array(
+        [(np.cos(p) * np.cos(t), np.cos(p) * np.sin(t), np.sin(p)) for p in theta for t in theta]
+    )
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], float)
     points = (signs[:, None] * (half - r + r * octant)).reshape(-1, 3)
     return Manifold.hull_points(np.ascontiguousarray(points + np.asarray(centre, float)))
@@ -101,7 +103,7 @@ def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)
 
     Args:
         path: [K, 3]; its bends must be wider than the section.
-        section: [N, 2] or [K, N, 2] star-shaped polygon: first axis sideways (tangent x up), second along `up`.
+        section: [N, 2] or [K, N, 2] star-shaped polygon: first axis tangent x up, second along `up`.
         up: direction the section's second axis follows; not parallel to the path.
     """
     path = np.asarray(path, float)
@@ -113,19 +115,25 @@ def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)
     return loft(path[:, None] + section[..., :1] * side[:, None] + section[..., 1:] * over[:, None])
 
 
-def tube(path: np.ndarray, radius: float | np.ndarray, segments: int = 12, up: Sequence[float] = (0, 0, 1)) -> Manifold:
+def tube(
+    path: np.ndarray, radius: float | np.ndarray, segments: int = 12, up: Sequence[float] = (0, 0, 1)
+) -> Manifold:
     """A round bar along a path; `radius` is one number or one per point of the path."""
     radii = np.broadcast_to(radius, len(path))
     return sweep(path, radii[:, None, None] * circle(segments), up)
 
 
-def bar(start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None) -> Manifold:
+def bar(
+    start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None
+) -> Manifold:
     """A straight round bar, tapered from radius to end_radius."""
     end_radius = radius if end_radius is None else end_radius
     return _along(lathe([(radius, 0.0), (end_radius, 1.0)], 14, stretch=False), start, end)
 
 
-def square_bar(start: Sequence[float], end: Sequence[float], width: float, end_width: float | None = None) -> Manifold:
+def square_bar(
+    start: Sequence[float], end: Sequence[float], width: float, end_width: float | None = None
+) -> Manifold:
     """A straight bar of square section with its sides along x and y, cut level at both ends."""
     end_width = width if end_width is None else end_width
     square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
@@ -154,7 +162,9 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS, stre
         stretch: let the polygon's area equal the circle's, so that few sides do not shrink it.
     """
     profile = np.asarray(profile, float)
-    ring = circle(segments) * (np.sqrt(2 * np.pi / segments / np.sin(2 * np.pi / segments)) if stretch else 1.0)
+    ring = circle(segments) * (
+        np.sqrt(2 * np.pi / segments / np.sin(2 * np.pi / segments)) if stretch else 1.0
+    )
     rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in profile]
     return loft(np.array(rings))
 
@@ -185,7 +195,9 @@ def circle(segments: int) -> np.ndarray:
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def rounded_rectangle(width: float, depth: float, radius: float, back_width: float | None = None) -> np.ndarray:
+def rounded_rectangle(
+    width: float, depth: float, radius: float, back_width: float | None = None
+) -> np.ndarray:
     """[N, 2] rectangle around 0 with rounded corners; `back_width` is its width at +y where it tapers."""
     back_width = width if back_width is None else back_width
     corners = [(-width, -depth, 180), (width, -depth, 270), (back_width, depth, 0), (-back_width, depth, 90)]
