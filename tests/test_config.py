@@ -84,7 +84,7 @@ def test_paper_scale_has_a_third_of_deepsdfs_parameters(experiment):
 
 
 def test_evaluation_recipe_is_the_papers():
-    evaluation = build(composed()["evaluate"], "evaluate")
+    evaluation = build(composed("scale=paper")["evaluate"], "evaluate")
     assert evaluation.points == 30_000
     assert (evaluation.fit.steps, evaluation.fit.lr, evaluation.fit.samples) == (800, 5e-3, 8000)
 

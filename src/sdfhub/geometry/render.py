@@ -8,12 +8,12 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-CLAY = (0.42, 0.56, 0.78)
+CLAY = (0.30, 0.46, 0.72)
 """Default surface colour, linear RGB."""
 
 _CREASE = np.cos(np.radians(38))  # edges sharper than this stay sharp
 _SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
-_KEY = np.array([-0.35, -0.65, 0.85])
+_KEY = np.array([-0.45, -0.6, 0.95])
 _FILL = np.array([0.9, -0.25, 0.25])
 
 
@@ -26,7 +26,7 @@ def render(
     elevation: float = 24.0,
     colour: tuple[float, float, float] = CLAY,
     background: float = 1.0,
-    occlusion_rays: int = 6,
+    occlusion_rays: int = 8,
 ) -> np.ndarray:
     """A shaded picture of a mesh from a three-quarter view.
 
@@ -40,7 +40,7 @@ def render(
         elevation: height of the camera above the horizon in degrees.
         colour: linear RGB of the surface, each in [0, 1].
         background: sRGB grey level around the shape, in [0, 1].
-        occlusion_rays: ambient-occlusion rays per sample (four samples a pixel); 0 turns it off.
+        occlusion_rays: rays to the sky per sample (four samples a pixel); 0 leaves the sky unoccluded.
 
     Returns:
         [size, size, 3] uint8, sRGB.
@@ -56,7 +56,7 @@ def render(
         seen = np.flatnonzero(hits["primID"] >= 0)
         points = origins[seen] + hits["tfar"][seen, None] * directions[seen]
         normals, flat = _normals(vertices, faces, hits, seen, directions[seen])
-        light = _light(scene, points, normals, flat, occlusion_rays)
+        light = _light(scene, points, normals, flat, _subpixel(seen, 2 * size), occlusion_rays)
         image[seen] = np.asarray(colour) * light
     image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
@@ -105,6 +105,12 @@ def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndar
     return origins.astype(np.float32), directions.astype(np.float32)
 
 
+def _subpixel(samples: np.ndarray, width: int) -> np.ndarray:
+    """Which of its pixel's four samples each one is."""
+    row, column = np.divmod(samples, width)
+    return 2 * (row % 2) + column % 2
+
+
 def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed and flat unit normals at the hits, both turned towards the camera."""
     cross = np.cross(
@@ -143,29 +149,48 @@ def _corner_normals(faces: np.ndarray, cross: np.ndarray, of_face: np.ndarray) -
     return corners.reshape(-1, 3, 3)
 
 
-def _light(scene, points, normals, flat, rays: int) -> np.ndarray:
-    """[N, 3] light that reaches each point: key with a cast shadow, fill, and sky with ambient occlusion."""
+def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
+    """[N, 3] light that reaches each point: a soft key, a fill and a sky dome, each with its shadows.
+
+    The four samples of a pixel look at four interleaved sets of lights, so their mean sees all of them and
+    shadows are soft without noise.
+    """
     start = (points + 2e-3 * flat).astype(np.float32)
-    key = np.clip(normals @ _unit(_KEY), 0, None)
+    around = _unit(_KEY) + 0.09 * _sphere(4)  # the key is an area light
+    key = _lit(scene, start, normals, _unit(around)[subpixel])
     fill = np.clip(normals @ _unit(_FILL), 0, None)
-    sky = 0.5 + 0.5 * normals[:, 2]
-    rng = np.random.default_rng(0)
-    wide = _unit(_unit(_KEY) + 0.12 * rng.normal(size=points.shape))  # an area light: soft shadow edges
-    key = key * _free(scene, start, wide)
-    open_share = 1.0
-    if rays:
-        blocked = np.zeros(len(points))
-        for _ in range(rays):
-            blocked += 1 - _free(scene, start, _unit(normals + 0.98 * _unit(rng.normal(size=points.shape))))
-        open_share = 1 - blocked / rays
-    warm, cool = np.array([1.0, 0.96, 0.9]), np.array([0.86, 0.93, 1.0])
-    ambient = (0.35 + 0.35 * sky) * open_share
-    return 0.85 * key[:, None] * warm + (0.18 * fill + ambient)[:, None] * cool
+    sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
+    warm, cool = np.array([1.0, 0.95, 0.87]), np.array([0.88, 0.95, 1.0])
+    return key[:, None] * warm + (0.04 * fill + 0.4 * sky)[:, None] * cool
 
 
-def _free(scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """1 where a ray meets nothing, 0 where it is blocked."""
-    return (scene.run(origins, directions.astype(np.float32), query="OCCLUDED") < 0).astype(np.float64)
+def _sky(scene: EmbreeScene, origins, normals, subpixel, rays: int) -> np.ndarray:
+    """[N] light from a dome of 4 * rays directions; about 1 for an open level plane."""
+    dome = _sphere(4 * rays)
+    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor throws some light back
+    total = np.zeros(len(origins))
+    for k in range(rays):
+        chosen = 4 * k + subpixel
+        total += strength[chosen] * _lit(scene, origins, normals, dome[chosen])
+    return 4 / rays * total
+
+
+def _lit(scene: EmbreeScene, origins: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
+    """Cosine towards each point's own light, 0 where it is blocked."""
+    cosine = np.clip(np.einsum("ij,ij->i", normals, lights), 0, None)
+    facing = np.flatnonzero(cosine > 0)
+    hit = scene.run(origins[facing], lights[facing].astype(np.float32), query="OCCLUDED") >= 0
+    cosine[facing[hit]] = 0
+    return cosine
+
+
+def _sphere(count: int) -> np.ndarray:
+    """[count, 3] unit vectors spread evenly (Fibonacci lattice), neighbours far apart in order."""
+    k = np.arange(count)
+    z = 1 - (2 * k + 1) / count
+    turn = k * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(1 - z * z)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sdfhub.data.procedural import chairs, lamps, sofas, tables
+from sdfhub.data.procedural import chairs, lamps, planes, sofas, tables
 from sdfhub.data.procedural.parameters import draw
 from sdfhub.errors import SdfhubError
 
@@ -12,6 +12,7 @@ VERSION = 1
 _DESIGNS = {
     "chairs": (1, chairs.Chair),
     "lamps": (2, lamps.Lamp),
+    "planes": (3, planes.Plane),
     "sofas": (4, sofas.Sofa),
     "tables": (5, tables.Table),
 }  # the code seeds the draw: never reuse or change one

@@ -5,6 +5,7 @@ solids is one shell, a union of solids that merely touch is not.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
@@ -77,8 +78,17 @@ def loft(sections: np.ndarray) -> Manifold:
     Args:
         sections: [K, N, 3] points of K star-shaped sections of N points each, all with one sense of rotation.
     """
-    k, n = sections.shape[:2]
     vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
+    faces = _loft_faces(*sections.shape[:2])
+    a, b, c = np.moveaxis((vertices - vertices.mean(0))[faces], 1, 0)
+    if np.vdot(np.cross(a, b), c) < 0:  # six times the volume
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    return Manifold(Mesh64(np.ascontiguousarray(vertices), faces))
+
+
+@lru_cache(maxsize=256)
+def _loft_faces(k: int, n: int) -> np.ndarray:
+    """[F, 3] uint64 faces between k rings of n points, and fans around the two centres that follow them."""
     i, j = np.meshgrid(np.arange(k - 1), np.arange(n), indexing="ij")
     a, b = (i * n + j).ravel(), (i * n + (j + 1) % n).ravel()
     ring, following = np.arange(n), (np.arange(n) + 1) % n
@@ -91,11 +101,7 @@ def loft(sections: np.ndarray) -> Manifold:
             np.column_stack([last + ring, last + following, np.full(n, k * n + 1)]),
         ]
     )
-    corners = vertices[faces] - vertices.mean(0)
-    if np.linalg.det(corners).sum() < 0:
-        faces = faces[:, ::-1]
-    mesh = Mesh64(np.ascontiguousarray(vertices), np.ascontiguousarray(faces.astype(np.uint64)))
-    return Manifold(mesh)
+    return np.ascontiguousarray(faces.astype(np.uint64))
 
 
 def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)) -> Manifold:

@@ -94,7 +94,7 @@ def superellipse(segments: int, power: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Station:
-    """One section of a lifting surface: leading edge, chord, and the roll of its thickness (0 is a wing's)."""
+    """One section of a lifting surface: leading edge, chord, and the roll of its thickness (0: a wing's)."""
 
     leading_edge: tuple[float, float, float]
     chord: float
@@ -189,7 +189,13 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
     made = [body_of_revolution([(hub * q, hub * t) for q, t in profile], centre, 20)]
     chord = max(0.22 * radius, 2.2 * gauge)
     sections = []
-    for share, width, twist in ((0.0, 0.5, 60), (0.3, 0.8, 45), (0.6, 1.0, 28), (0.92, 0.85, 18), (1, 0.5, 16)):
+    for share, width, twist in (
+        (0.0, 0.5, 60),
+        (0.3, 0.8, 45),
+        (0.6, 1.0, 28),
+        (0.92, 0.85, 18),
+        (1, 0.5, 16),
+    ):
         ring = superellipse(12, 2.5) * [width * chord / 2, gauge / 2]
         c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
         flat = ring @ np.array([[c, s], [-s, c]])

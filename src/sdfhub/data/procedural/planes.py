@@ -1,4 +1,4 @@
-"""Aircraft: airliners, business jets, turboprops, light singles, gliders, fighters, from one set of parameters."""
+"""Aircraft: airliners, business jets, turboprops, light singles, gliders, fighters; one set of parameters."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from manifold3d import Manifold
 
-from sdfhub.data.procedural import parts, plane_tails
+from sdfhub.data.procedural import parts, plane_engines, plane_tails
 from sdfhub.data.procedural import plane_parts as pp
 from sdfhub.data.procedural.parameters import choice, continuous
 
@@ -92,5 +92,170 @@ class Plane:
         body = self.body.solid()
         if self.kind in ("airliner", "business jet", "turboprop"):
             body = self._windscreen(body)
-        solids = [body, self._wing(), *plane_tails.tail(self), *self._powerplant(), *self._canopy(), *self._gear()]
+        solids = [
+            body,
+            self._wing(),
+            *plane_tails.tail(self),
+            *plane_engines.powerplant(self),
+            *self._canopy(),
+            *self._gear(),
+        ]
         return parts.union(solids).scale((self.base.length * self.size,) * 3)
+
+    @property
+    def base(self) -> Proportions:
+        """The proportions of its kind."""
+        return KINDS[self.kind]
+
+    @property
+    def gauge(self) -> float:
+        """Thickness of its thinnest parts: a share of the bounding radius, so that they can be sampled."""
+        return 0.0085 * max(1.06, self.base.span * self.span)
+
+    @property
+    def body(self) -> pp.Fuselage:
+        """Its fuselage."""
+        b = self.base
+        upsweep = 0.4 * self.upsweep if self.kind in ("fighter", "single") else self.upsweep
+        nose = b.nose * self.nose_length
+        radius = b.radius * self.girth
+        end = max(b.end, 1.3 * self.gauge / radius)
+        return pp.Fuselage(
+            radius, b.tall, nose, b.tail, b.tip, end, b.bluntness, b.boom, b.square, upsweep, self.nose_droop
+        )
+
+    @property
+    def semi_span(self) -> float:
+        """From the centre line to the wing's tip."""
+        return self.base.span * self.span / 2
+
+    def leading_edge(self, share: float) -> np.ndarray:
+        """[3] point of the right wing's leading edge; share 0 is the centre line, 1 the tip."""
+        x = share * self.semi_span
+        y = self.base.wing + self.wing_shift + x * np.tan(np.radians(self._sweep))
+        half, high = self.body.half_height(0), {"low": -0.62, "mid": 0.0, "high": 0.72}[self.mount]
+        if self.kind == "single" and self.mount == "high":
+            high = 1 + 0.38 * self.canopy_height
+        if self.kind == "fighter":
+            high *= 0.6
+        fall = -0.35 if self.mount == "high" and self.kind != "glider" else 1.0
+        return np.array([x, y, half * high + x * np.tan(np.radians(fall * self.dihedral))])
+
+    def wing_chord(self, share: float) -> float:
+        """Chord of the wing; an airliner's inner trailing edge runs straight out to its kink."""
+        root = self.base.chord * self.chord
+        tip = root * self.base.taper * self.taper
+        if self.kind not in ("airliner", "business jet"):
+            return root + share * (tip - root)
+        kink = max(root - 0.95 * 0.36 * self.semi_span * np.tan(np.radians(self._sweep)), 1.25 * tip)
+        return float(np.interp(share, [0, 0.36, 1], [root, kink, tip]))
+
+    def wing_point(self, share: float, along: float = 0.4) -> np.ndarray:
+        """[3] point inside the right wing, `along` chords behind its leading edge."""
+        return self.leading_edge(share) + [0, along * self.wing_chord(share), 0]
+
+    @property
+    def _sweep(self) -> float:
+        straight = self.kind in ("turboprop", "single", "glider")
+        return self.base.sweep + (0.3 if straight else 1.0) * self.sweep
+
+    def _wing(self) -> Manifold:
+        roll = np.arctan2(*(self.leading_edge(1) - self.leading_edge(0))[[2, 0]])
+        half = [pp.Station(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
+        half += self._wing_tip(roll)
+        left = [pp.Station(s.leading_edge * np.array([-1, 1, 1]), s.chord, -s.roll) for s in reversed(half)]
+        middle = pp.Station(self.leading_edge(0), self.wing_chord(0))
+        ratio = 0.06 if self.kind == "fighter" else 0.13
+        wing = pp.lifting_surface([*left, middle, *half], ratio, self.gauge, 0.0 if ratio < 0.1 else 0.015)
+        if self.tips != "tank" or self.kind in ("airliner", "glider"):
+            return wing
+        r, a = 1.25 * self.gauge, 1.5 * max(self.wing_chord(1), 0.09)
+        shape = [(0.15, -0.5), (0.6, -0.42), (0.95, -0.28), (1, 0), (0.9, 0.25), (0.5, 0.43), (0.2, 0.5)]
+        tank = pp.body_of_revolution([(r * q, a * t) for q, t in shape], self.wing_point(0.99, 0.5), 16)
+        return parts.union([wing, *parts.mirrored(tank)])
+
+    def _wing_tip(self, roll: float) -> list[pp.Station]:
+        """Sections beyond 97% of the half span: rounded off, or turned up into a winglet."""
+        tip, chord = self.leading_edge(1), self.wing_chord(1)
+        if self.tips != "winglet" or self.kind in ("fighter", "single"):
+            return [pp.Station(tip + [0, 0.12 * chord, 0], 0.8 * chord, roll)]
+        tall, stations = self.winglet_height * self.semi_span, []
+        for up, out, trim, turn in ((0.06, 0.12, 0.06, 0.45), (0.22, 0.24, 0.2, 0.9), (1.0, 0.5, 0.8, 1.0)):
+            point = tip + np.array([out * tall, trim * min(chord, tall), up * tall])
+            stations.append(pp.Station(point, chord * (1 - 0.55 * trim), roll + turn * (1.2 - roll)))
+        return stations
+
+    def _windscreen(self, body: Manifold) -> Manifold:
+        """The nose with its upper front cut flat, as by the panes of a flight deck."""
+        y = -0.5 + 0.42 * self.body.nose
+        top, slope = self.body.top(y), np.radians(48)
+        normal = np.array([0, np.sin(slope), -np.cos(slope)])
+        return body.trim_by_plane(tuple(normal), float(normal @ [0, y - 0.004, top - 0.004]))
+
+    def _canopy(self) -> list[Manifold]:
+        """A bubble over the cockpit, or the fairing where an airliner's wing meets its body."""
+        body, tall = self.body, self.canopy_height * self.body.half_height(0)
+        front = -0.5 + 0.55 * body.nose
+        if self.kind == "single":
+            front = -0.5 + body.nose + 0.03
+            rear = 0.16 if self.mount == "high" else 0.1
+            wide, high = 0.86 * body.radius, tall * 0.75 + 0.4 * body.half_height(0)
+            return [
+                pp.canopy(front, rear, 0.42, lambda y: body.axis(y) + 0.35 * body.half_height(y), wide, high)
+            ]
+        if self.kind in ("glider", "fighter"):
+            length = 0.24 if self.kind == "fighter" else 0.2
+            wide, high = 0.62 * body.radius, 0.85 * tall
+            return [
+                pp.canopy(
+                    front, front + length, 0.4, lambda y: body.axis(y) + 0.4 * body.half_height(y), wide, high
+                )
+            ]
+        centre = self.wing_point(0, 0.5) * [0, 1, 0.95]
+        return [
+            parts.ellipsoid((0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius), centre, 24)
+        ]
+
+    def _gear(self) -> list[Manifold]:
+        """Struts and wheels: a pair under the wing or the body, and a third at the nose or the tail."""
+        if self.gear == "retracted":
+            return []
+        body, b, r = self.body, self.base, self.base.wheel
+        ground = -body.half_height(0) - b.clearance
+        if self.kind == "glider":
+            return [pp.wheel(r, 2.4 * self.gauge, (0, self.wing_point(0)[1] - 0.03, ground + r))]
+        tail_wheel = self.gear == "taildragger" and self.kind in ("single", "turboprop")
+        y = self.wing_point(0, 0.12 if tail_wheel else 0.62)[1]
+        under_body = self.mount == "high" or self.kind == "fighter"
+        x = body.radius * 1.5 if under_body else max(0.24 * self.semi_span, body.radius + 0.03)
+        share = 0.3 if under_body else x / self.semi_span
+        top = np.array([0.3 * body.radius, y, -0.4 * body.half_height(0)])
+        if not under_body:
+            top = self.leading_edge(share) + [0, 0, 0]
+            y = top[1] = np.clip(y, *(self.wing_point(share, a)[1] for a in (0.25, 0.7)))
+        made = parts.mirrored(parts.union(self._leg(top, np.array([x, y, ground + r]), r)))
+        if tail_wheel:
+            y = 0.44
+            foot = np.array([0, y + 0.015, body.axis(y) - body.half_height(y) - 0.7 * r])
+            return made + self._leg(np.array([0, y, body.axis(y)]), foot, 0.5 * r)
+        y = -0.5 + body.nose * (0.9 if self.kind != "fighter" else 0.8)
+        return made + self._leg(np.array([0, y, body.axis(y)]), np.array([0, y, ground + 0.85 * r]), 0.85 * r)
+
+    def _leg(self, top: np.ndarray, axle: np.ndarray, radius: float) -> list[Manifold]:
+        """One strut with a wheel, two wheels under an airliner, a fairing over a light aircraft's."""
+        thick = 0.62 * self.gauge
+        made = [parts.bar(top, axle, 1.15 * thick, thick)]
+        if self.kind == "airliner":
+            offset = np.array([0.9 * radius, 0, 0])
+            made.append(parts.bar(axle - offset, axle + offset, thick))
+            return made + [pp.wheel(radius, 0.8 * radius, axle + s * offset) for s in (-1, 1)]
+        made.append(pp.wheel(radius, max(0.7 * radius, 1.8 * self.gauge), axle))
+        if self.kind == "single" and self.spats:
+            made.append(
+                parts.ellipsoid(
+                    (0.55 * radius + 0.004, 1.7 * radius, 0.7 * radius),
+                    axle + [0, 0.3 * radius, 0.3 * radius],
+                    16,
+                )
+            )
+        return made
