@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 
 import lightning as L
+import numpy as np
 import pytest
 import torch
 import yaml
 
 from sdfhub.data.procedural import generate
+from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
 from sdfhub.tasks.evaluate import evaluate_run
 from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
@@ -162,14 +164,18 @@ def test_loading_runs_no_code_of_a_strangers_checkpoint(trained, tmp_path):
 
     (tmp_path / "checkpoints").mkdir()
     torch.save({"state_dict": Stranger()}, tmp_path / "checkpoints" / "last.ckpt")
-    with pytest.raises(Exception, match="not a readable checkpoint"):
+    with pytest.raises(SdfhubError, match="not a readable checkpoint"):
         load_autodecoder(tmp_path, config)
+    config["decoder"]["width"] += 1
+    with pytest.raises(SdfhubError, match="another model"):
+        load_autodecoder(folder, config)
+    config["decoder"]["width"] -= 1
     assert not canary.exists()
     assert load_autodecoder(folder, config).codes.table.shape[0] == 3
 
 
 def test_evaluate_without_a_run_says_so(tmp_path):
-    with pytest.raises(Exception, match="not a run's folder"):
+    with pytest.raises(SdfhubError, match="not a run's folder"):
         evaluate_run(composed("run=" + str(tmp_path), config_name="evaluate"))
 
 
@@ -222,7 +228,7 @@ def ball_batches():
 @pytest.mark.parametrize(("activation", "encoding", "normals"), COMBINATIONS)
 def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
     config = composed(f"activation={activation}", f"encoding={encoding}", f"normals={normals}")
-    module = build_autodecoder(config, rows=4)
+    module = build_autodecoder(config, rows=4, steps=30)
     config["trainer"]["max_epochs"] = 1
     losses = []
 
@@ -286,6 +292,33 @@ def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_pa
     )
     assert "3 shapes kept, 1 rejected" in done.stdout
     assert "broken" in done.stdout
+
+
+def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tmp_path):
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        points = rng.uniform(-1, 1, (6000, 3))
+        rows = np.column_stack([points, np.linalg.norm(points, axis=1) - 0.4 - 0.1 * index]).astype(np.float32)
+        sides = {"pos": rows[rows[:, 3] >= 0], "neg": rows[rows[:, 3] < 0]}
+        folder = tmp_path / "SdfSamples" / "ShapeNetV2" / "03001627"
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(folder / f"ball{index}.npz", **sides)
+    common = [
+        *TINY,
+        "data=deepsdf",
+        f"data.source.root={tmp_path / 'SdfSamples'}",
+        "data.shapes=2",
+        "data.held_out=1",
+        f"data.store={tmp_path / 'store'}",
+        f"output_root={tmp_path / 'outputs'}",
+    ]
+    refused = run(["train.py"], *common, expect=2)
+    assert "train with normals=off" in refused.stderr.strip().splitlines()[-1]
+    done = run(["train.py"], *common, "normals=off", "trainer.max_epochs=5")
+    assert "judged by signed distances" in done.stdout
+    metrics = json.loads((only_run(tmp_path / "outputs") / "metrics.json").read_text())
+    assert metrics["known"]["summary"]["sign_accuracy"]["mean"] > 0.95
+    assert len(metrics["held_out"]["shapes"]) == 1
 
 
 @pytest.mark.skipif(not OPEN.is_dir(), reason="data/open is not there; `make data` fetches it")

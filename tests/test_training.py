@@ -146,8 +146,10 @@ def test_processes_share_a_step_without_overlap():
 
 
 def test_an_epoch_goes_on_where_the_last_ended():
-    steps = EpochSteps(4)
-    steps.set_epoch(2)
+    done = 8
+    steps = EpochSteps(4, done=lambda: done)
+    assert list(steps) == [8, 9, 10, 11]
+    done = 10  # a run stopped in the middle of an epoch repeats it from its start
     assert list(steps) == [8, 9, 10, 11]
 
 

@@ -4,7 +4,7 @@ A batch is a function of (seed, step), so that a resumed run sees what an uninte
 number of loader workers. Shards are pre-shuffled, so a random draw is one contiguous, wrapping slice.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import lightning as L
@@ -139,19 +139,24 @@ def wrapping_slice(array: np.ndarray, count: int, rng: np.random.Generator) -> n
 
 
 class EpochSteps(Sampler[int]):
-    """The step numbers of one epoch. Lightning tells the epoch through `set_epoch`, also after a resume."""
+    """The step numbers of one epoch: those that follow the steps already done.
 
-    def __init__(self, steps: int):
-        self.steps, self.epoch = steps, 0
+    Lightning's own `set_epoch` comes too early after a resume: it starts again at epoch 0.
 
-    def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
+    Args:
+        steps: steps of an epoch.
+        done: tells how many steps have been done, also after a resume.
+    """
+
+    def __init__(self, steps: int, done: Callable[[], int]):
+        self.steps, self.done = steps, done
 
     def __len__(self) -> int:
         return self.steps
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(self.epoch * self.steps, (self.epoch + 1) * self.steps))
+        first = self.done() // self.steps * self.steps
+        return iter(range(first, first + self.steps))
 
 
 class SdfDataModule(L.LightningDataModule):
@@ -202,12 +207,16 @@ class SdfDataModule(L.LightningDataModule):
         """Rows that the code table needs: shapes and their augmented copies."""
         return self.batches.rows
 
+    @property
+    def steps_per_epoch(self) -> int:
+        """Training steps of one epoch."""
+        return self.batches.steps_per_pass * self.passes_per_epoch
+
     def train_dataloader(self) -> DataLoader:
-        if self.trainer is not None:
-            self.batches.share(self.trainer.global_rank, self.trainer.world_size)
+        self.batches.share(self.trainer.global_rank, self.trainer.world_size)
         return DataLoader(
             self.batches,
-            sampler=EpochSteps(self.batches.steps_per_pass * self.passes_per_epoch),
+            sampler=EpochSteps(self.steps_per_epoch, done=lambda: self.trainer.global_step),
             batch_size=None,
             num_workers=self.workers,
             persistent_workers=False,  # a worker of the last epoch would not hear of the next

@@ -38,7 +38,7 @@ def contact_sheet(
         for j, image in enumerate(row):
             x, y = left + j * size, top + i * size
             if image is None:
-                _no_surface(draw, x, y, size, font)
+                _no_surface(draw, x, y, size)
             else:
                 page.paste(Image.fromarray(image), (x, y))
     for i, label in enumerate(row_labels):
@@ -49,8 +49,8 @@ def contact_sheet(
     return _write_png(page, Path(path))
 
 
-def _no_surface(draw: ImageDraw.ImageDraw, x: int, y: int, size: int, font) -> None:
-    pad = size // 16
+def _no_surface(draw: ImageDraw.ImageDraw, x: int, y: int, size: int) -> None:
+    pad, font = size // 16, ImageFont.load_default(max(6, size // 9))
     draw.rectangle((x + pad, y + pad, x + size - pad, y + size - pad), fill=_TILE, outline=_FAINT)
     draw.text((x + size / 2, y + size / 2), "no surface", fill=_FAINT, font=font, anchor="mm")
 

@@ -156,8 +156,8 @@ def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
     shadows are soft without noise.
     """
     start = (points + 2e-3 * flat).astype(np.float32)
-    around = _unit(_KEY) + 0.09 * _sphere(4)  # the key is an area light
-    key = _lit(scene, start, normals, _unit(around)[subpixel])
+    around = _unit(_unit(_KEY) + 0.09 * _sphere(12))  # the key is an area light
+    key = sum(_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)) / 3
     fill = np.clip(normals @ _unit(_FILL), 0, None)
     sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
     warm, cool = np.array([1.0, 0.95, 0.87]), np.array([0.88, 0.95, 1.0])
@@ -167,7 +167,9 @@ def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
 def _sky(scene: EmbreeScene, origins, normals, subpixel, rays: int) -> np.ndarray:
     """[N] light from a dome of 4 * rays directions; about 1 for an open level plane."""
     dome = _sphere(4 * rays)
-    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor throws some light back
+    strength = np.where(
+        dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3
+    )  # a pale floor throws some light back
     total = np.zeros(len(origins))
     for k in range(rays):
         chosen = 4 * k + subpixel

@@ -24,14 +24,16 @@ class AutoDecoder(L.LightningModule):
         codes: one row per training shape.
         loss: the objective and its weights.
         optim: makes the optimiser and its schedule.
+        steps: optimiser steps of the whole training, for the schedules. It is not asked of the trainer, whose
+            answer opens the data loader before a resumed run knows where it stands.
         seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
             run repeats an uninterrupted one.
     """
 
-    def __init__(self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, seed: int = 0):
+    def __init__(self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, steps: int, seed: int = 0):
         super().__init__()
         self.decoder, self.codes = decoder, codes
-        self.loss, self.optim, self.seed = loss, optim, seed
+        self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed
         self._step_started = time.perf_counter()
 
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:
@@ -61,11 +63,6 @@ class AutoDecoder(L.LightningModule):
     def progress(self) -> float:
         """Share of training done, in [0, 1]."""
         return self.global_step / self.steps
-
-    @property
-    def steps(self) -> int:
-        """Optimiser steps of the whole training."""
-        return int(self.trainer.estimated_stepping_batches)
 
     def configure_optimizers(self):
         optimizer, schedule = self.optim.configure(

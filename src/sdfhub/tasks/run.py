@@ -58,35 +58,65 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
     return config, split
 
 
-def build_autodecoder(config: dict[str, Any], rows: int) -> AutoDecoder:
-    """The untrained model that a plain config describes, with `rows` codes. Seeds the weights."""
+def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> AutoDecoder:
+    """The untrained model that a plain config describes, seeded.
+
+    Args:
+        config: what `config.yaml` of a run holds.
+        rows: codes in the table.
+        steps: optimiser steps of the whole training; only training needs it.
+    """
     torch.manual_seed(config["seed"])
     return AutoDecoder(
         decoder=build(config["decoder"], "decoder", within="sdfhub.model"),
         codes=build(config["codes"], "codes", within="sdfhub.model")(shapes=rows),
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
+        steps=steps,
         seed=config["seed"],
     )
 
 
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The `state_dict` of a checkpoint, on the CPU. Runs no code of it.
+
+    Raises:
+        SdfhubError: no such file, or not a checkpoint of an auto-decoder.
+    """
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+        weights["codes.table"].shape  # noqa: B018 - anything else is not ours
+    except FileNotFoundError as error:
+        raise SdfhubError(
+            f"{path}: there is no such checkpoint; a run keeps checkpoints/last.ckpt"
+        ) from error
+    except Exception as error:  # torch names a dozen kinds of damage
+        detail = (str(error).splitlines() or [""])[0]
+        raise SdfhubError(f"{path}: not a readable checkpoint of an auto-decoder: {detail}") from error
+    return weights
+
+
+def put_weights(model: AutoDecoder, weights: dict[str, torch.Tensor], path: Path) -> None:
+    """Loads weights into a model.
+
+    Raises:
+        SdfhubError: they belong to a model of another shape; `path` says whose they are.
+    """
+    try:
+        model.load_state_dict(weights)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        detail = str(error).splitlines()[-1].strip()
+        raise SdfhubError(f"{path}: holds another model than the one configured: {detail}") from error
+
+
 def load_autodecoder(run: Path, config: dict[str, Any]) -> AutoDecoder:
-    """The trained model of a run, on the CPU, in evaluation mode. Runs no code of the checkpoint.
+    """The trained model of a run, on the CPU, in evaluation mode.
 
     Raises:
         SdfhubError: no readable checkpoint, or one of another model.
     """
     path = run / "checkpoints" / "last.ckpt"
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-    except FileNotFoundError as error:
-        raise SdfhubError(f"{path}: there is no checkpoint; has the run trained to the end?") from error
-    except Exception as error:  # torch names a dozen kinds of damage
-        raise SdfhubError(f"{path}: not a readable checkpoint: {str(error).splitlines()[0]}") from error
-    try:
-        model = build_autodecoder(config, rows=len(state["codes.table"]))
-        model.load_state_dict(state)
-    except (RuntimeError, KeyError, TypeError) as error:
-        detail = str(error).splitlines()[-1].strip()
-        raise SdfhubError(f"{path}: does not fit the model of config.yaml: {detail}") from error
+    weights = read_weights(path)
+    model = build_autodecoder(config, rows=len(weights["codes.table"]))
+    put_weights(model, weights, path)
     return model.eval()

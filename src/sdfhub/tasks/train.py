@@ -20,7 +20,7 @@ from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.prepare import prepare_data
-from sdfhub.tasks.run import begin_run, build_autodecoder
+from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_weights
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Parts:
     callbacks: list[Callback]
     make_loader: Callable[..., SdfDataModule]
     make_trainer: Callable[..., Trainer]
-    resume_from: str | None
+    resume_from: Path | None
 
 
 def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     parts = build_parts(config, run)
     prepared = prepare_data(config["data"])
     loader = parts.make_loader(shapes=prepared.train)
-    model = build_autodecoder(config, loader.rows)
+    model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
     record = TrainingRecord()
     trainer = _trainer(parts, run, record)
@@ -57,6 +57,12 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     return evaluate_model(model, known, prepared.held_out, parts.evaluation, run, record.summary(model))
 
 
+def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
+    """Optimiser steps of a whole training, from the trainer's `max_epochs` and `max_steps`."""
+    epochs = trainer["max_epochs"] * steps_per_epoch
+    return epochs if trainer.get("max_steps", -1) < 0 else min(epochs, trainer["max_steps"])
+
+
 def build_parts(config: dict[str, Any], run: Path) -> Parts:
     """The parts of a training run.
 
@@ -64,16 +70,15 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
         SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
     """
     config["seed"] = check(config["seed"], int, "seed")
-    resume_from = check(config["ckpt_path"], str | None, "ckpt_path")
-    if resume_from is not None and not Path(resume_from).is_file():
-        raise SdfhubError(
-            f"ckpt_path={resume_from}: there is no such file; a run keeps checkpoints/last.ckpt"
-        )
+    resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
+    weights = read_weights(resume_from) if resume_from else None
     every = {
         key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
     }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    build_autodecoder(config, rows=1)
+    model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
+    if weights:
+        put_weights(model, weights, resume_from)
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
         callbacks=[*callbacks, *checkpointing(run / "checkpoints", **every)],

@@ -1,6 +1,7 @@
 """The five categories by name, and the mesh of any of their shapes."""
 
 import numpy as np
+from manifold3d import Manifold
 
 from sdfhub.data.procedural import chairs, lamps, planes, sofas, tables
 from sdfhub.data.procedural.parameters import draw
@@ -52,6 +53,15 @@ def generate(category: str, index: int) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         SdfhubError: for an unknown category or a negative index.
     """
-    mesh = design(category, index).build().to_mesh64()
+    mesh = _outer_shell(design(category, index).build()).to_mesh64()
     vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
     return vertices, np.array(mesh.tri_verts, dtype=np.int64)
+
+
+def _outer_shell(solid: Manifold) -> Manifold:
+    """The solid without pockets closed in between its parts and without slivers that a boolean split off."""
+    pieces = solid.decompose()
+    if len(pieces) == 1:
+        return solid
+    least = 1e-5 * solid.volume()
+    return Manifold.compose([piece for piece in pieces if piece.volume() > least])

@@ -122,7 +122,9 @@ def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     profile = np.column_stack([radius, tall * np.sin(angle)])
     size = min(0.36 * wide, 0.3 * tall)
     made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
-    made.append(parts.lathe([(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)]))
+    made.append(
+        parts.lathe([(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)])
+    )
     if hung:
         made += [*_bulb(0.42 * tall, size, gauge, False), _rod(0.42 * tall, tall + 4 * gauge, gauge)]
     else:

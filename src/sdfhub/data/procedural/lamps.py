@@ -1,6 +1,7 @@
 """Lamps: floor, table, desk, arc and tripod lamps and pendants, as one parametric design."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from manifold3d import Manifold
@@ -29,7 +30,9 @@ class Lamp:
     reach: float = continuous(0.45, 0.75)
     elbow: float = continuous(0.4, 0.62)
     tilt: float = continuous(0.0, 40.0)
-    kind: str = choice("floor", "table", "table", "table", "desk", "desk", "arc", "tripod", "pendant", "pendant")
+    kind: str = choice(
+        "floor", "table", "table", "table", "desk", "desk", "arc", "tripod", "pendant", "pendant"
+    )
     shade: str = choice("drum", "cone", "cone", "bell", "pleated", "dome", "globe", "bowl")
     base: str = choice("disc", "disc", "cube", "feet", "vase", "gourd", "turned", "bottle")
     arm: str = choice("single", "paired", "bent")
@@ -72,9 +75,12 @@ class Lamp:
         low, g = self.tall() - lamp_shades.height(self), self.gauge()
         made = [lamp_shades.head(self, hung=False).translate((0, 0, low))]
         if self.base in ("disc", "cube", "feet"):
-            made += [*self._plinth(), self._rod(0.03 * self.tall(), low, 1.25 * g)]
+            made += [*self._plinth(), self._rod(0.4 * self.base_height, low, 1.25 * g)]
         else:
-            made += [self._body(0.93 * low if self.kind == "table" else 0.4 * low), self._rod(0.02, low, 1.25 * g)]
+            made += [
+                self._body(0.93 * low if self.kind == "table" else 0.4 * low),
+                self._rod(0.02, low, 1.25 * g),
+            ]
         if self.collar:
             made.append(parts.ellipsoid((2.4 * g, 2.4 * g, 1.6 * g), (0, 0, 0.93 * low), 18))
         return made
@@ -88,11 +94,19 @@ class Lamp:
             made = [self._rod(0.5 * r, 0.9 * r, 2.2 * g)]
             for a in 2 * np.pi * np.arange(3) / 3 - np.pi / 2:
                 way = np.array([np.cos(a), np.sin(a), 0])
-                path = parts.arc(0.8 * r * np.array([0, 0, 1]), 1.25 * r * way + [0, 0, 1.3 * g], 0.22 * r * (way + [0, 0, 1]))
+                path = parts.arc(
+                    0.8 * r * np.array([0, 0, 1]),
+                    1.25 * r * way + [0, 0, 1.3 * g],
+                    0.22 * r * (way + [0, 0, 1]),
+                )
                 made += [parts.tube(path, 1.25 * g, up=(-way[1], way[0], 0.0))]
                 made.append(parts.ellipsoid((1.9 * g, 1.9 * g, 1.5 * g), path[-1] + [0, 0, 0.2 * g], 14))
             return made
-        crown = [(0.55 * r, 1.25 * h), (2.2 * g, 1.45 * h), (1.4 * g, 2.2 * h)] if self.collar else [(0.96 * r, 1.1 * h)]
+        crown = (
+            [(0.55 * r, 1.25 * h), (2.2 * g, 1.45 * h), (1.4 * g, 2.2 * h)]
+            if self.collar
+            else [(0.96 * r, 1.1 * h)]
+        )
         return [parts.lathe([(r, 0), (r, 0.7 * h), (0.98 * r, 0.9 * h), *crown], 40)]
 
     def _body(self, top: float) -> Manifold:
@@ -125,8 +139,9 @@ class Lamp:
     def _desk(self) -> list[Manifold]:
         """Two jointed arms, or one bent tube, with a tilted shade at the end."""
         tall, g, foot = self.tall(), self.gauge(), self._foot()
-        start = np.array([0, 0.5 * foot, self.base_height * tall * 0.6])
-        bend = np.array([0, 0.5 * foot + 0.3 * self.elbow * tall, (0.3 + 0.6 * self.elbow) * tall])
+        rear = 0.0 if self.base == "feet" else 0.5 * foot  # feet carry it at their hub
+        start = np.array([0, rear, 0.7 * foot if self.base == "feet" else self.base_height * tall * 0.6])
+        bend = np.array([0, rear + 0.3 * self.elbow * tall, (0.3 + 0.6 * self.elbow) * tall])
         end = np.array([0, -self.reach * 0.8 * tall, 0.86 * tall])
         made = self._plinth() if self.base != "cube" else [self._block()]
         if self.arm == "bent":
@@ -170,7 +185,9 @@ class Lamp:
         low = tall - lamp_shades.height(self)
         hub, spread = 0.93 * low, 0.2 * tall * self.base_width * (0.7 + 0.5 * self.reach)
         made = [lamp_shades.head(self, hung=False).translate((0, 0, low))]
-        made.append(parts.lathe([(3.4 * g, hub - 0.03), (3.4 * g, hub + 0.02), (1.3 * g, hub + 0.04), (1.3 * g, low)]))
+        made.append(
+            parts.lathe([(3.4 * g, hub - 0.03), (3.4 * g, hub + 0.02), (1.3 * g, hub + 0.04), (1.3 * g, low)])
+        )
         thick = 1.5 * g
         feet = []
         for a in 2 * np.pi * np.arange(3) / 3 - np.pi / 2:
@@ -180,7 +197,11 @@ class Lamp:
             feet.append(foot)
         if self.arm != "single":
             rung = [f * (1 - self.elbow) + [0, 0, self.elbow * hub] for f in feet]
-            hubs = [rung[1], rung[2], rung[0]] if self.arm == "paired" else [np.array([0, 0, self.elbow * hub])] * 3
+            hubs = (
+                [rung[1], rung[2], rung[0]]
+                if self.arm == "paired"
+                else [np.array([0, 0, self.elbow * hub])] * 3
+            )
             made += [parts.bar(a, b, 0.9 * g) for a, b in zip(rung, hubs, strict=True)]
         return made
 
@@ -204,7 +225,7 @@ class Lamp:
 def _smooth(keys: list[tuple[float, float]], steps: int = 5) -> list[tuple[float, float]]:
     """(radius, height) pairs with an S-curve between each two."""
     profile = [keys[0]]
-    for (r0, h0), (r1, h1) in zip(keys[:-1], keys[1:], strict=True):
+    for (r0, h0), (r1, h1) in pairwise(keys):
         t = np.linspace(0, 1, steps + 1)[1:]
         profile += list(zip(r0 + (r1 - r0) * t * t * (3 - 2 * t), h0 + (h1 - h0) * t, strict=True))
     return profile

@@ -59,9 +59,12 @@ def _wing_propellers(plane) -> list[Manifold]:
     tip = (0.1 if plane.engines == 1 else 0.082) * plane.engine_size
     first = plane.body.radius + tip + 0.025
     places = [first] if plane.engines == 1 else [first, first + 2 * tip + 0.025]
-    made = []
+    made, r = [], 0.26 * tip
+    turning = parts.union(
+        pp.propeller(tip, 0.56 * r, plane.blades + 1, plane.gauge, (0, -0.088, 0), plane.blade_turn)
+    )
     for x in places:
-        share, r = x / plane.semi_span, 0.26 * tip
+        share = x / plane.semi_span
         centre = plane.leading_edge(share) + [0, 0, -0.35 * r]
         chord = plane.wing_chord(share)
         shape = [
@@ -73,9 +76,8 @@ def _wing_propellers(plane) -> list[Manifold]:
             (0.25, 1.3 * chord),
         ]
         nacelle = pp.body_of_revolution([(r * q, t) for q, t in shape], centre)
-        hub = centre + [0, -0.088, 0]
-        turning = pp.propeller(tip, 0.56 * r, plane.blades + 1, plane.gauge, hub, plane.blade_turn)
-        made += parts.mirrored(parts.union([nacelle, *turning]))
+        # Joined before they are mirrored: half the booleans.
+        made += parts.mirrored(parts.union([nacelle, turning.translate(tuple(centre))]))
     return made
 
 
@@ -96,9 +98,8 @@ def _afterburners(plane) -> list[Manifold]:
     r = (0.8 if plane.engines == 1 else 0.58) * body.half_width(0.5) * plane.engine_size
     made, z = [], body.axis(0.5)
     for x in [0.0] if plane.engines == 1 else [-0.92 * r, 0.92 * r]:
-        outside = [(0.9 * r, 0.38), (1.12 * r, 0.48), (1.12 * r, 0.51), (0.92 * r, 0.56)]
-        bore = [(0.5 * r, 0.525), (0.62 * r, 0.57)]
-        made.append(pp.body_of_revolution(outside, (x, 0, z)) - pp.body_of_revolution(bore, (x, 0, z)))
+        shape = [(1.12, 0.38), (1.12, 0.51), (0.92, 0.56), (0.64, 0.56), (0.54, 0.525), (0.1, 0.525)]
+        made.append(pp.body_of_revolution([(r * q, y) for q, y in shape], (x, 0, z)))
     return made + parts.mirrored(_intake(plane))
 
 
@@ -106,15 +107,11 @@ def _intake(plane) -> Manifold:
     """A box beside the body, raked and open in front, that fades towards the tail."""
     wide, tall = 0.62 * plane.body.radius, 0.85 * plane.body.half_height(0)
     front = -0.16 + plane.engine_shift
-    unit = pp.superellipse(24, 5.0)
-
-    def tunnel(stations, shrink: float) -> Manifold:
-        rings = []
-        for y, share, rake in stations:
-            x = plane.body.radius * (0.62 + 0.38 * share) + (share * wide - shrink) * unit[:, 0]
-            z = -0.1 * tall + (share * tall - shrink) * unit[:, 1]
-            rings.append(np.column_stack([x, y - rake * unit[:, 1], z]))
-        return parts.loft(np.array(rings))
-
-    outside = tunnel([(front, 0.92, 0.02), (front + 0.12, 1.0, 0), (0.2, 0.95, 0), (0.44, 0.5, 0)], 0.0)
-    return outside - tunnel([(front - 0.03, 0.92, 0.02), (front + 0.035, 0.92, 0.02)], 1.2 * plane.gauge)
+    unit, rings = pp.superellipse(24, 5.0), []
+    wall = 1.2 * plane.gauge
+    mouth = [(front + 0.035, 0.92, 0.02, wall), (front, 0.92, 0.02, wall), (front, 0.92, 0.02, 0.0)]
+    for y, share, rake, shrink in [*mouth, (front + 0.12, 1, 0, 0), (0.2, 0.95, 0, 0), (0.44, 0.3, 0, 0)]:
+        x = plane.body.radius * (0.62 + 0.38 * share) + (share * wide - shrink) * unit[:, 0]
+        z = -0.1 * tall + (share * tall - shrink) * unit[:, 1]
+        rings.append(np.column_stack([x, y - rake * unit[:, 1], z]))
+    return parts.loft(np.array(rings))

@@ -64,7 +64,7 @@ class Fuselage:
         """Height of the roof at y."""
         return self.axis(y) + self.half_height(y)
 
-    def solid(self, segments: int = 32) -> Manifold:
+    def solid(self, segments: int = 28) -> Manifold:
         """The body, its nose and tail closed by small discs."""
         stretch = np.linspace(0.06, 1, 12) ** 2
         nose, tail = -0.5 + self.nose * stretch, 0.5 - self.tail * np.linspace(1, 0, 14)
@@ -78,7 +78,7 @@ class Fuselage:
     def _phases(self, y: float) -> tuple[float, float]:
         """How far y lies into the nose and into the tail, each 0 in the cabin and 1 at the end."""
         ahead, behind = (self.nose - 0.5 - y) / self.nose, (y - 0.5 + self.tail) / self.tail
-        return float(np.clip(ahead, 0, 1)), float(np.clip(behind, 0, 1))
+        return min(max(ahead, 0.0), 1.0), min(max(behind, 0.0), 1.0)
 
     def _ring(self, y: float, segments: int) -> np.ndarray:
         unit = superellipse(segments, self.square)
@@ -101,7 +101,7 @@ class Station:
     roll: float = 0.0
 
 
-def aerofoil(points: int = 10) -> tuple[np.ndarray, np.ndarray]:
+def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """A section of unit chord and unit thickness.
 
     Source: NACA report 460, thickness of the four-digit sections.
@@ -159,19 +159,19 @@ def panel(root, direction, length: float, chords, sweep: float, ratio: float, ga
     return lifting_surface(stations, ratio, gauge)
 
 
-def body_of_revolution(profile, centre, segments: int = 24) -> Manifold:
-    """A lathe along y: `profile` holds (radius, y) from front to back, moved to `centre`."""
+def body_of_revolution(profile, centre, segments: int = 18) -> Manifold:
+    """A lathe along y around `centre`; `profile` holds (radius, y) from the front axis to the rear axis."""
     return parts.lathe(profile, segments).rotate((-90.0, 0.0, 0.0)).translate(tuple(map(float, centre)))
 
 
 def jet(radius: float, length: float, centre) -> Manifold:
     """A turbofan nacelle with an open inlet, a spinner inside it and an exhaust cone."""
-    r, a = radius, length
-    shape = [(0.86, 0.0), (0.93, 0.03), (1.0, 0.16), (1.0, 0.4), (0.9, 0.7), (0.74, 0.86), (0.44, 0.87)]
-    outside = body_of_revolution([(r * q, a * t) for q, t in [*shape, (0.36, 0.98), (0.16, 1.12)]], centre)
-    bore = body_of_revolution([(0.7 * r, -0.1 * a), (0.7 * r, 0.05 * a), (0.66 * r, 0.3 * a)], centre)
-    spinner = body_of_revolution([(0.06 * r, 0.12 * a), (0.24 * r, 0.2 * a), (0.3 * r, 0.4 * a)], centre, 16)
-    return parts.union([outside - bore, spinner])
+    spinner = [(0.06, 0.1), (0.2, 0.15), (0.3, 0.28)]
+    inlet = [(0.66, 0.28), (0.7, 0.04), (0.78, 0.0), (0.86, 0.0)]
+    cowl = [(0.94, 0.03), (1.0, 0.16), (1.0, 0.4), (0.9, 0.7), (0.74, 0.86), (0.44, 0.87)]
+    cone = [(0.36, 0.98), (0.16, 1.12)]
+    profile = [(radius * q, length * t) for q, t in spinner + inlet + cowl + cone]
+    return body_of_revolution(profile, centre, 20)
 
 
 def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
@@ -186,7 +186,7 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
         turn: angle of the first blade, degrees.
     """
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
-    made = [body_of_revolution([(hub * q, hub * t) for q, t in profile], centre, 20)]
+    made = [body_of_revolution([(hub * q, hub * t) for q, t in profile], centre, 14)]
     chord = max(0.22 * radius, 2.2 * gauge)
     sections = []
     for share, width, twist in (
@@ -196,10 +196,10 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
         (0.92, 0.85, 18),
         (1, 0.5, 16),
     ):
-        ring = superellipse(12, 2.5) * [width * chord / 2, gauge / 2]
+        ring = superellipse(10, 2.5) * [width * chord / 2, gauge / 2]
         c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
         flat = ring @ np.array([[c, s], [-s, c]])
-        sections.append(np.column_stack([flat, np.full(12, share * radius)]))
+        sections.append(np.column_stack([flat, np.full(len(ring), share * radius)]))
     blade = parts.loft(np.array(sections))
     for k in range(blades):
         made.append(blade.rotate((0.0, turn + 360.0 * k / blades, 0.0)).translate(tuple(map(float, centre))))
@@ -210,7 +210,7 @@ def wheel(radius: float, width: float, centre) -> Manifold:
     """A tyre with rounded shoulders, its axle along x."""
     r, w = radius, width / 2
     profile = [(0.55 * r, -w), (0.84 * r, -w), (r, -0.5 * w), (r, 0.5 * w), (0.84 * r, w), (0.55 * r, w)]
-    return parts.lathe(profile, 20).rotate((0.0, 90.0, 0.0)).translate(tuple(map(float, centre)))
+    return parts.lathe(profile, 16).rotate((0.0, 90.0, 0.0)).translate(tuple(map(float, centre)))
 
 
 def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
@@ -223,14 +223,14 @@ def canopy(front: float, back: float, peak: float, base, half_width: float, heig
         half_width: at the peak.
         height: above the base.
     """
-    unit = superellipse(24, 2.4)
+    unit = superellipse(20, 2.4)
     sections = []
-    for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 16))) / 2:
+    for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 14))) / 2:
         side = (peak - t) / peak if t < peak else (t - peak) / (1 - peak)
         rise = (1 - side**2) ** 0.62
         y = front + t * (back - front)
         wide = half_width * (0.3 + 0.7 * rise)
         ring = unit * [wide, 1.0]
         z = base(y) + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
-        sections.append(np.column_stack([ring[:, 0], np.full(24, y), z]))
+        sections.append(np.column_stack([ring[:, 0], np.full(len(unit), y), z]))
     return parts.loft(np.array(sections))

@@ -99,5 +99,5 @@ def _fighter_fins(plane) -> list[Manifold]:
 
 def _foreplanes(plane) -> list[Manifold]:
     """Canards behind the cockpit instead of a tailplane."""
-    root = np.array([-0.004, -0.2 + plane.wing_shift, 0.35 * plane.body.half_height(-0.2)])
-    return _plane_at(plane, root, 0.05, 0.17 * _size(plane), 0.12)
+    root = np.array([-0.004, -0.31, plane.body.axis(-0.26) + 0.3 * plane.body.half_height(-0.26)])
+    return _plane_at(plane, root, 0.05, 0.15 * _size(plane), 0.1)

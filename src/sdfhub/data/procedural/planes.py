@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from manifold3d import Manifold
 
-from sdfhub.data.procedural import parts, plane_engines, plane_tails
+from sdfhub.data.procedural import parts, plane_engines, plane_gear, plane_tails
 from sdfhub.data.procedural import plane_parts as pp
 from sdfhub.data.procedural.parameters import choice, continuous
 
@@ -48,7 +48,7 @@ KINDS = {
         8, 0.07, 1.12, 0.16, 0.62, 0.62, 0.2, 0.5, 0.9, 2.7, 1.3, 0.18, 0.72, 2, -0.2, 1.1, 0.085, 0.031
     ),
     "glider": Proportions(
-        7, 0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1, 2.1, 0.125, 0.42, 1.5, -0.16, 1.0, 0.014, 0.03
+        7, 0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1, 1.75, 0.125, 0.42, 1.5, -0.16, 1.0, 0.014, 0.03
     ),
     "fighter": Proportions(
         15, 0.054, 1.0, 0.36, 0.3, 0.05, 0.8, 0.75, 1.0, 2.4, 0.66, 0.4, 0.16, 46, -0.06, 1.05, 0.055, 0.022
@@ -58,7 +58,10 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Plane:
-    """One aircraft, its nose towards -y. The numbers scale or shift the proportions of its kind."""
+    """One aircraft, its nose towards -y. The numbers scale or shift the proportions of its kind.
+
+    What a kind cannot have is read as its nearest: a jet with a tail wheel stands on a nose wheel.
+    """
 
     kind: str = choice(*KINDS)
     mount: str = choice("low", "low", "mid", "high", "high")
@@ -94,11 +97,11 @@ class Plane:
             body = self._windscreen(body)
         solids = [
             body,
-            self._wing(),
+            *self._wing(),
             *plane_tails.tail(self),
             *plane_engines.powerplant(self),
             *self._canopy(),
-            *self._gear(),
+            *plane_gear.gear(self),
         ]
         return parts.union(solids).scale((self.base.length * self.size,) * 3)
 
@@ -110,7 +113,7 @@ class Plane:
     @property
     def gauge(self) -> float:
         """Thickness of its thinnest parts: a share of the bounding radius, so that they can be sampled."""
-        return 0.0085 * max(1.06, self.base.span * self.span)
+        return 0.0092 * max(1.06, self.base.span * self.span)
 
     @property
     def body(self) -> pp.Fuselage:
@@ -159,7 +162,7 @@ class Plane:
         straight = self.kind in ("turboprop", "single", "glider")
         return self.base.sweep + (0.3 if straight else 1.0) * self.sweep
 
-    def _wing(self) -> Manifold:
+    def _wing(self) -> list[Manifold]:
         roll = np.arctan2(*(self.leading_edge(1) - self.leading_edge(0))[[2, 0]])
         half = [pp.Station(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
         half += self._wing_tip(roll)
@@ -168,11 +171,11 @@ class Plane:
         ratio = 0.06 if self.kind == "fighter" else 0.13
         wing = pp.lifting_surface([*left, middle, *half], ratio, self.gauge, 0.0 if ratio < 0.1 else 0.015)
         if self.tips != "tank" or self.kind in ("airliner", "glider"):
-            return wing
+            return [wing]
         r, a = 1.25 * self.gauge, 1.5 * max(self.wing_chord(1), 0.09)
         shape = [(0.15, -0.5), (0.6, -0.42), (0.95, -0.28), (1, 0), (0.9, 0.25), (0.5, 0.43), (0.2, 0.5)]
         tank = pp.body_of_revolution([(r * q, a * t) for q, t in shape], self.wing_point(0.99, 0.5), 16)
-        return parts.union([wing, *parts.mirrored(tank)])
+        return [wing, *parts.mirrored(tank)]
 
     def _wing_tip(self, roll: float) -> list[pp.Station]:
         """Sections beyond 97% of the half span: rounded off, or turned up into a winglet."""
@@ -187,10 +190,10 @@ class Plane:
 
     def _windscreen(self, body: Manifold) -> Manifold:
         """The nose with its upper front cut flat, as by the panes of a flight deck."""
-        y = -0.5 + 0.42 * self.body.nose
-        top, slope = self.body.top(y), np.radians(48)
-        normal = np.array([0, np.sin(slope), -np.cos(slope)])
-        return body.trim_by_plane(tuple(normal), float(normal @ [0, y - 0.004, top - 0.004]))
+        across = np.array([np.sin(0.8), -np.cos(0.8)])
+        along = np.linspace(-0.5, -0.5 + self.body.nose, 60)
+        nearest = min(across @ [y, self.body.top(y)] for y in along)
+        return body.trim_by_plane((0.0, *across), nearest + 0.17 * self.body.radius)
 
     def _canopy(self) -> list[Manifold]:
         """A bubble over the cockpit, or the fairing where an airliner's wing meets its body."""
@@ -213,49 +216,5 @@ class Plane:
             ]
         centre = self.wing_point(0, 0.5) * [0, 1, 0.95]
         return [
-            parts.ellipsoid((0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius), centre, 24)
+            parts.ellipsoid((0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius), centre, 20)
         ]
-
-    def _gear(self) -> list[Manifold]:
-        """Struts and wheels: a pair under the wing or the body, and a third at the nose or the tail."""
-        if self.gear == "retracted":
-            return []
-        body, b, r = self.body, self.base, self.base.wheel
-        ground = -body.half_height(0) - b.clearance
-        if self.kind == "glider":
-            return [pp.wheel(r, 2.4 * self.gauge, (0, self.wing_point(0)[1] - 0.03, ground + r))]
-        tail_wheel = self.gear == "taildragger" and self.kind in ("single", "turboprop")
-        y = self.wing_point(0, 0.12 if tail_wheel else 0.62)[1]
-        under_body = self.mount == "high" or self.kind == "fighter"
-        x = body.radius * 1.5 if under_body else max(0.24 * self.semi_span, body.radius + 0.03)
-        share = 0.3 if under_body else x / self.semi_span
-        top = np.array([0.3 * body.radius, y, -0.4 * body.half_height(0)])
-        if not under_body:
-            top = self.leading_edge(share) + [0, 0, 0]
-            y = top[1] = np.clip(y, *(self.wing_point(share, a)[1] for a in (0.25, 0.7)))
-        made = parts.mirrored(parts.union(self._leg(top, np.array([x, y, ground + r]), r)))
-        if tail_wheel:
-            y = 0.44
-            foot = np.array([0, y + 0.015, body.axis(y) - body.half_height(y) - 0.7 * r])
-            return made + self._leg(np.array([0, y, body.axis(y)]), foot, 0.5 * r)
-        y = -0.5 + body.nose * (0.9 if self.kind != "fighter" else 0.8)
-        return made + self._leg(np.array([0, y, body.axis(y)]), np.array([0, y, ground + 0.85 * r]), 0.85 * r)
-
-    def _leg(self, top: np.ndarray, axle: np.ndarray, radius: float) -> list[Manifold]:
-        """One strut with a wheel, two wheels under an airliner, a fairing over a light aircraft's."""
-        thick = 0.62 * self.gauge
-        made = [parts.bar(top, axle, 1.15 * thick, thick)]
-        if self.kind == "airliner":
-            offset = np.array([0.9 * radius, 0, 0])
-            made.append(parts.bar(axle - offset, axle + offset, thick))
-            return made + [pp.wheel(radius, 0.8 * radius, axle + s * offset) for s in (-1, 1)]
-        made.append(pp.wheel(radius, max(0.7 * radius, 1.8 * self.gauge), axle))
-        if self.kind == "single" and self.spats:
-            made.append(
-                parts.ellipsoid(
-                    (0.55 * radius + 0.004, 1.7 * radius, 0.7 * radius),
-                    axle + [0, 0.3 * radius, 0.3 * radius],
-                    16,
-                )
-            )
-        return made

@@ -28,7 +28,9 @@ class Table:
     stretcher_height: float = continuous(0.16, 0.34)
     foot_reach: float = continuous(0.55, 0.8)
     top: str = choice("rectangle", "rectangle", "rounded", "boat", "oval", "round")
-    base: str = choice("square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop")
+    base: str = choice(
+        "square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop"
+    )
     stretchers: str = choice("none", "none", "h", "box", "shelf")
     apron: bool = choice(True, False)
     drawers: int = choice(0, 0, 1, 2, 3)
@@ -62,13 +64,18 @@ class Table:
 
     def _top(self) -> Manifold:
         return parts.pad(
-            self._outline(), self.height - self.top_thickness, self.height, self.edge_round * self.top_thickness
+            self._outline(),
+            self.height - self.top_thickness,
+            self.height,
+            self.edge_round * self.top_thickness,
         )
 
     def _corner(self) -> np.ndarray:
         """(x, y) of the legs' axes in the quadrant where both are positive, under every kind of top."""
-        share = {"rectangle": 1.0, "rounded": 0.94, "boat": 0.84, "oval": 0.74, "round": 0.7}[self.top]
-        return share * self._size() / 2 - 0.5 * self.leg_width - 0.5 * self.overhang
+        share = {"rectangle": 1.0, "rounded": 1.0, "boat": 0.84, "oval": 0.74, "round": 0.7}[self.top]
+        cut = 0.09 * self._size()[1] if self.top == "rounded" else 0.0  # what its round corners take away
+        inset = cut + 0.5 * self.leg_width + 0.5 * self.overhang
+        return share * self._size() / 2 - inset - (0.02 if self.base == "hairpin" else 0.0)
 
     def _ends(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(top, foot) of the legs: front left, front right, back left, back right."""
@@ -151,7 +158,9 @@ class Table:
         w, foot, made = self.leg_width, 0.07, []
         for side in (-x, x):
             made.append(parts.rounded_box((1.15 * w, 2 * y, foot), (side, 0, foot / 2), 0.02))
-            made.append(parts.square_bar((side, 0, 0.5 * foot), (side, 0, self._under()), w * (2.4 - self.leg_taper)))
+            made.append(
+                parts.square_bar((side, 0, 0.5 * foot), (side, 0, self._under()), w * (2.4 - self.leg_taper))
+            )
             made.append(parts.rounded_box((1.1 * w, 1.7 * y, 0.06), (side, 0, self._under() - 0.02), 0.015))
         z = self.height * (0.2 + self.stretcher_height)
         made.append(parts.plank((-x - 0.08, 0, z), (x + 0.08, 0, z), 0.034, 0.075))
@@ -165,26 +174,40 @@ class Table:
             for tilt in (-1, 1):
                 start, end = (side, -tilt * y, low), (side, tilt * y * 0.92, self._under())
                 made.append(parts.square_bar(start, end, thick))
-            made.append(parts.plank((side, -y, self._under() - 0.02), (side, y, self._under() - 0.02), thick, 0.05))
+            made.append(
+                parts.plank((side, -y, self._under() - 0.02), (side, y, self._under() - 0.02), thick, 0.05)
+            )
         z = self._under() / 1.92
         made.append(parts.bar((-x, 0, z), (x, 0, z), 0.4 * thick + 0.006))
         return made
 
     def _pedestal(self) -> list[Manifold]:
-        """A turned column on curved feet."""
+        """A turned column on curved feet; a long table stands on two."""
+        length, depth = self._size()
+        column = parts.union(self._column(self.foot_reach * depth / 2 + 0.08))
+        if length < 1.45 * depth:
+            return [column]
+        beam = parts.plank(
+            (-0.25 * length, 0, self._under() - 0.03), (0.25 * length, 0, self._under() - 0.03), 0.05, 0.06
+        )
+        return [
+            column.translate((-0.25 * length, 0.0, 0.0)),
+            column.translate((0.25 * length, 0.0, 0.0)),
+            beam,
+        ]
+
+    def _column(self, reach: float) -> list[Manifold]:
         r, z, low = 0.85 * self.leg_width, self._under(), 0.14 * self.height
         waist = 0.4 + 0.4 * self.leg_taper
         knots = [(1.0, 0), (1.0, 0.2), (waist, 0.26), (1.25, 0.42), (1.1, 0.52), (waist, 0.7), (waist, 0.8)]
         knots += [(1.0, 0.84), (1.0, 0.88), (1.9, 0.95), (2.6, 0.96), (2.6, 1.0)]
         made = [parts.lathe([(r * a, low + (z - low) * h) for a, h in knots], 28)]
-        reach = self.foot_reach * min(self._size()) / 2 + 0.06
         thick = 0.5 * self.leg_width + 0.008
+        drop = [(0.0, 0.22), (0.25, 0.225), (0.5, 0.16), (0.75, 0.07), (1.0, 0.034)]
         for angle in 2 * np.pi * np.arange(self.feet) / self.feet - np.pi / 2:
             out = np.array([np.cos(angle), np.sin(angle), 0])
-            drop = [(0.0, 0.22), (0.25, 0.225), (0.5, 0.16), (0.75, 0.07), (1.0, 0.034)]
             path = np.array([reach * a * out + [0, 0, h * self.height + 0.01] for a, h in drop])
-            section = parts.rounded_rectangle(thick, 0.07, 0.012)
-            made.append(parts.sweep(path, section))
+            made.append(parts.sweep(path, parts.rounded_rectangle(thick, 0.07, 0.012)))
             made.append(parts.ellipsoid((thick, thick, 0.034), reach * out + [0, 0, 0.034], 14))
         return made
 
@@ -197,7 +220,11 @@ class Table:
             foot, top = side * (x - 0.6 * self.leg_splay), side * x
             ring = parts.rounded_rectangle(thick, 2 * y, 0.006)
             bottom = np.column_stack([ring + [foot, 0], np.zeros(len(ring))])
-            made.append(parts.loft(np.array([bottom, np.column_stack([ring + [top, 0], np.full(len(ring), self._under())])])))
+            made.append(
+                parts.loft(
+                    np.array([bottom, np.column_stack([ring + [top, 0], np.full(len(ring), self._under())])])
+                )
+            )
         z = self.height - self.top_thickness - self.apron_height / 2 + 0.01
         made.append(parts.plank((-x, 0, z), (x, 0, z), 0.03, self.apron_height + 0.02))
         if self.stretchers == "shelf":

@@ -1,0 +1,48 @@
+"""Seconds to make 100 procedural shapes of each category on one core, and their face counts.
+
+    python benchmarks/procedural.py [--shapes 100] [--sheet FOLDER]
+
+With --sheet it also draws a contact sheet of the first 24 shapes of each category.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sdfhub.data.procedural import CATEGORIES, generate
+from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.render import render
+from sdfhub.shapes import RADIUS
+
+
+def picture(category: str, index: int) -> np.ndarray:
+    vertices, faces = generate(category, index)
+    vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
+    return render(vertices * RADIUS / np.linalg.norm(vertices, axis=1).max(), faces, 256)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--shapes", type=int, default=100)
+    parser.add_argument("--sheet", type=Path, help="folder for contact sheets")
+    args = parser.parse_args()
+    print(
+        f"{'category':10} {'CPU s':>6} {'faces, least':>13} {'median':>7} {'most':>6}  ({args.shapes} shapes)"
+    )
+    for category in CATEGORIES:
+        start = time.process_time()
+        counts = [len(generate(category, index)[1]) for index in range(args.shapes)]
+        seconds = time.process_time() - start
+        print(f"{category:10} {seconds:6.2f} {min(counts):13} {int(np.median(counts)):7} {max(counts):6}")
+        if args.sheet:
+            pictures = [picture(category, index) for index in range(24)]
+            rows = [pictures[k : k + 6] for k in range(0, 24, 6)]
+            print(contact_sheet(rows, [f"{k}" for k in range(0, 24, 6)], [], args.sheet / f"{category}.png"))
+
+
+if __name__ == "__main__":
+    main()

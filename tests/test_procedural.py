@@ -1,0 +1,113 @@
+"""Properties of the procedural shapes: closed solids, repeatable, distinct, moved by every parameter."""
+
+from dataclasses import astuple, fields, replace
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sdfhub.data.procedural import CATEGORIES, design, generate
+from sdfhub.errors import SdfhubError
+
+SAMPLE = range(0, 96, 8)
+
+
+@pytest.fixture(scope="module")
+def meshes() -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    return {category: [generate(category, i) for i in SAMPLE] for category in CATEGORIES}
+
+
+def shells(vertices: np.ndarray, faces: np.ndarray) -> int:
+    ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    graph = coo_array((np.ones(faces.size), ends), shape=(len(vertices),) * 2)
+    return connected_components(graph, directed=False)[0]
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    return float(np.linalg.det(vertices[faces] - vertices.mean(0)).sum() / 6)
+
+
+def test_five_categories_are_on_offer():
+    assert set(CATEGORIES) == {"chairs", "lamps", "planes", "sofas", "tables"}
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_every_edge_is_shared_by_two_faces_that_run_along_it_in_opposite_directions(meshes, category):
+    for vertices, faces in meshes[category]:
+        assert vertices.dtype == np.float64 and faces.dtype == np.int64
+        directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+        key = directed @ [len(vertices), 1]
+        assert len(np.unique(key)) == len(key)
+        assert np.array_equal(np.sort(key), np.sort(directed[:, ::-1] @ [len(vertices), 1]))
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_each_shape_is_one_solid_of_positive_volume_and_moderate_size(meshes, category):
+    for index, (vertices, faces) in zip(SAMPLE, meshes[category], strict=True):
+        assert shells(vertices, faces) == 1, f"{category} {index}"
+        assert volume(vertices, faces) > 0
+        assert 200 <= len(faces) <= 20_000
+        assert np.isfinite(vertices).all()
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_an_index_always_gives_the_same_shape(meshes, category):
+    for position in (0, len(SAMPLE) - 1):
+        vertices, faces = generate(category, SAMPLE[position])
+        assert np.array_equal(vertices, meshes[category][position][0])
+        assert np.array_equal(faces, meshes[category][position][1])
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_a_thousand_designs_are_distinct_and_within_their_ranges(category):
+    designs = [design(category, i) for i in range(1000)]
+    assert len({astuple(d) for d in designs}) == 1000
+    for f in fields(designs[0]):
+        values = [getattr(d, f.name) for d in designs]
+        if "range" in f.metadata:
+            low, high = f.metadata["range"]
+            assert low <= min(values) and max(values) <= high
+        else:
+            assert set(values) == set(f.metadata["options"])
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_built_shapes_are_distinct(meshes, category):
+    assert len({round(volume(*mesh), 9) for mesh in meshes[category]}) == len(SAMPLE)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_a_design_has_eight_continuous_and_two_discrete_parameters(category):
+    declared = fields(design(category, 0))
+    assert all(("range" in f.metadata) != ("options" in f.metadata) for f in declared)
+    assert sum(f.type is float for f in declared if "range" in f.metadata) >= 8
+    assert sum("options" in f.metadata for f in declared) >= 2
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_every_parameter_moves_the_shape(category):
+    for f in fields(design(category, 0)):
+        assert any(_moves(design(category, i), f) for i in range(120)), f"{category}.{f.name} changes nothing"
+
+
+def _moves(chosen, f) -> bool:
+    """Whether another value of one field gives this design another solid."""
+    value = getattr(chosen, f.name)
+    if "range" in f.metadata:
+        other = max(f.metadata["range"], key=lambda end: abs(end - value))
+    else:
+        other = next(option for option in f.metadata["options"] if option != value)
+    before, after = chosen.build(), replace(chosen, **{f.name: other}).build()
+    return abs(before.volume() - after.volume()) > 1e-9 or before.num_tri() != after.num_tri()
+
+
+def test_an_unknown_category_is_refused_with_the_choices():
+    with pytest.raises(SdfhubError, match="chairs, lamps, planes, sofas, tables") as error:
+        generate("boats", 0)
+    assert "boats" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_negative_index_is_refused():
+    with pytest.raises(SdfhubError, match="index=-1"):
+        generate("chairs", -1)
