@@ -298,7 +298,9 @@ def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tm
     rng = np.random.default_rng(0)
     for index in range(3):
         points = rng.uniform(-1, 1, (6000, 3))
-        rows = np.column_stack([points, np.linalg.norm(points, axis=1) - 0.4 - 0.1 * index]).astype(np.float32)
+        rows = np.column_stack([points, np.linalg.norm(points, axis=1) - 0.4 - 0.1 * index]).astype(
+            np.float32
+        )
         sides = {"pos": rows[rows[:, 3] >= 0], "neg": rows[rows[:, 3] < 0]}
         folder = tmp_path / "SdfSamples" / "ShapeNetV2" / "03001627"
         folder.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,9 @@ class AutoDecoder(L.LightningModule):
             run repeats an uninterrupted one.
     """
 
-    def __init__(self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, steps: int, seed: int = 0):
+    def __init__(
+        self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, steps: int, seed: int = 0
+    ):
         super().__init__()
         self.decoder, self.codes = decoder, codes
         self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed

@@ -29,7 +29,9 @@ def _lean(sofa, z):
     return sofa.back_lean * np.clip((z - sofa.seat_height) / sofa.back_height, 0, None)
 
 
-def _wall(sofa, x: np.ndarray, top: np.ndarray, push: np.ndarray | float = 0.0, radius: float = 0.045) -> Manifold:
+def _wall(
+    sofa, x: np.ndarray, top: np.ndarray, push: np.ndarray | float = 0.0, radius: float = 0.045
+) -> Manifold:
     """A leaning wall with rounded top and ends.
 
     Args:
@@ -139,6 +141,8 @@ def _chesterfield(sofa) -> list[Manifold]:
     wall = parts.sweep(path + [0, 0, middle], section)
     bead = parts.tube(path + [0, 0, top - roll], roll, 24)
     deck = sofa.deck
-    fill = parts.box((2 * sofa.half_seat, sofa.back_thickness + 0.1, deck - sofa.leg_height - 0.02), 
-                     (0, rear - sofa.back_thickness / 2 - 0.05, (deck + sofa.leg_height) / 2))
+    fill = parts.box(
+        (2 * sofa.half_seat, sofa.back_thickness + 0.1, deck - sofa.leg_height - 0.02),
+        (0, rear - sofa.back_thickness / 2 - 0.05, (deck + sofa.leg_height) / 2),
+    )
     return [parts.union([wall, bead]), fill]

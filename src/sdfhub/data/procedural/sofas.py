@@ -116,7 +116,10 @@ class Sofa:
         """An arm whose top falls from the back to the front."""
         high = self.seat_height + self.arm_height + (self.back_height - self.arm_height) * self.arm_slope
         ends = []
-        for y, top in ((self.front + 0.06, self.seat_height + 0.5 * self.arm_height), (self.rear - 0.06, high)):
+        for y, top in (
+            (self.front + 0.06, self.seat_height + 0.5 * self.arm_height),
+            (self.rear - 0.06, high),
+        ):
             centre = (self.half_seat + self.arm_width / 2, y, (low + top) / 2)
             ends.append(parts.rounded_box((self.arm_width, 0.1, top - low), centre, 0.03, 4))
         return Manifold.batch_hull(ends)
