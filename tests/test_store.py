@@ -4,6 +4,7 @@ import dataclasses
 import os
 import pickle
 import time
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -236,7 +237,7 @@ def test_empty_arrays_have_their_columns(tmp_path, monkeypatch):
     assert shape.surface.shape == (0, 6) and shape.mesh is None
 
 
-def test_a_thousand_shapes_open_fast_and_hold_no_files(tmp_path):
+def test_a_thousand_shapes_open_fast(tmp_path):
     prepared = fill(tmp_path, Balls(1))
     manifest = store._read_manifest(prepared.folder)
     record = manifest["shapes"]["balls/0000"]
@@ -246,9 +247,15 @@ def test_a_thousand_shapes_open_fast_and_hold_no_files(tmp_path):
     start = time.perf_counter()
     many = fill(tmp_path, source)
     assert len(many) == 1000 and time.perf_counter() - start < 2
-    held = [many["balls/0000"].outside[:1] for _ in range(3)]
-    del held
-    assert not [f for f in os.listdir("/proc/self/fd") if _is_shard(f)]
+
+
+def test_no_more_maps_stay_open_than_allowed(tmp_path, monkeypatch):
+    shards._opened.cache_clear()
+    monkeypatch.setattr(shards, "_opened", lru_cache(maxsize=4)(shards._opened.__wrapped__))
+    for shape in [*fill(tmp_path, Balls(3))] * 2:
+        assert len(shape.outside) and len(shape.inside) and len(shape.surface)
+    held = [f for f in os.listdir("/proc/self/fd") if _is_shard(f)]
+    assert 1 <= len(held) <= 4
 
 
 def _is_shard(descriptor: str) -> bool:
