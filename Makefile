@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint data bench clean
+.PHONY: help install demo test lint data bench clean
 
 help: ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -23,10 +23,7 @@ demo: install ## train HOSC + Fourier + normals on procedural chairs and print t
 	$(BIN)/python train.py activation=hosc encoding=fourier scale=demo
 
 test: install ## run the tests
-	$(BIN)/python -m pytest
-
-test-slow: install ## run the tests that take minutes as well
-	$(BIN)/python -m pytest -m "slow or not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: install ## check style
 	$(BIN)/ruff check .

@@ -29,7 +29,7 @@ def train(name: str, *overrides: str) -> dict:
 
 
 def row(name: str, metrics: dict) -> str:
-    """A Markdown line for the known shapes: mean and median CD, floor, excess (times 10^3), failures, seconds."""
+    """A Markdown line for the known shapes: CD, floor and excess times 10^3, failures, size, seconds."""
     summary, training = metrics["known"]["summary"], metrics["training"]
     if summary["cd"]["mean"] is None:
         cells = ["no surface"] + [""] * 4

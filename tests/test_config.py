@@ -96,9 +96,9 @@ def test_normals_off_asks_for_no_surface_points():
 
 
 MISTAKES = {
-    "activation=hosk": ["hosk", "hosc", "siren"],
-    "activaton=hosc": ["activaton"],
-    "activation.betta=3": ["betta"],
+    "activation=hosk": ["hosk", "hosc relu siren"],
+    "activaton=hosc": ["activaton", "did you mean 'activation'"],
+    "activation.betta=3": ["betta", "conf/activation"],
     "activation.beta=abc": ["activation.beta", "abc"],
     "activation.beta=-1": ["beta", "positive"],
     "optim.lr_decoder=fast": ["optim.lr_decoder", "fast"],
@@ -107,7 +107,8 @@ MISTAKES = {
     "data.preparation.sign=guess": ["data.preparation.sign", "guess"],
     "data.preparation.samples=1.5": ["data.preparation.samples"],
     "trainer.max_epochs=ten": ["trainer.max_epochs", "ten"],
-    "trainer.accelerator=quantum": ["quantum"],
+    "trainer.accelerator=quantum": ["quantum", "trainer=auto"],
+    "trainer.acelerator=cpu": ["trainer.acelerator"],
     "seed=x": ["seed"],
     "ckpt_path=nowhere.ckpt": ["nowhere.ckpt"],
     "data=folder": ["data/meshes"],

@@ -5,6 +5,7 @@ import re
 import sys
 import uuid
 from collections.abc import Callable
+from difflib import get_close_matches
 from pathlib import Path
 
 import hydra
@@ -81,10 +82,18 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """What a user needs of an error message: its first statements and, for a wrong choice, the choices."""
-    text = str(error) or type(error).__name__
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [
-        line for line in lines if not re.match(r"(full_key|object_type|reference_type|Set the env)", line)
-    ]
-    return re.sub(r"\s+", " ", " ".join(told))
+    """What a user needs of an error: what is wrong and, for a wrong choice, the choices."""
+    text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
+    text = text.split(" Config search path:")[0].split(" full_key:")[0]
+    unknown = re.match(r"Could not override '([^']+)'", text)
+    return _no_such_key(unknown.group(1)) if unknown else text
+
+
+def _no_such_key(key: str) -> str:
+    group, _, below = key.partition(".")
+    groups = sorted(folder.name for folder in configuration_folder().iterdir() if folder.is_dir())
+    if below and group in groups:
+        return f"there is no key {key!r}; the YAMLs in conf/{group} hold the keys of {group}"
+    near = get_close_matches(key, groups, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"the groups are {', '.join(groups)}"
+    return f"there is no group or key {key!r}; {hint}"

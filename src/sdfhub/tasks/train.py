@@ -28,9 +28,9 @@ class Parts:
     """What a config describes, built and so checked before the first shape is prepared."""
 
     evaluation: Evaluation
-    callbacks: list[Callback]
     make_loader: Callable[..., SdfDataModule]
-    make_trainer: Callable[..., Trainer]
+    trainer: Trainer
+    record: TrainingRecord
     resume_from: Path | None
 
 
@@ -45,16 +45,15 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     loader = parts.make_loader(shapes=prepared.train)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
-    record = TrainingRecord()
-    trainer = _trainer(parts, run, record)
     print(f"run: {run}", flush=True)
+    trainer = parts.trainer
     trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not trainer.is_global_zero:
         return {}
     known = dict(enumerate(prepared.train))
-    return evaluate_model(model, known, prepared.held_out, parts.evaluation, run, record.summary(model))
+    return evaluate_model(model, known, prepared.held_out, parts.evaluation, run, parts.record.summary(model))
 
 
 def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
@@ -79,27 +78,25 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
     if weights:
         put_weights(model, weights, resume_from)
+    record = TrainingRecord()
+    callbacks += [record, *checkpointing(run / "checkpoints", **every)]
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
-        callbacks=[*callbacks, *checkpointing(run / "checkpoints", **every)],
         make_loader=build(config["data"]["loader"], "data.loader"),
-        make_trainer=build(config["trainer"], "trainer", within="lightning.pytorch"),
+        trainer=build_trainer(config["trainer"], run, callbacks),
+        record=record,
         resume_from=resume_from,
     )
 
 
-def _trainer(parts: Parts, run: Path, record: TrainingRecord) -> Trainer:
+def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
     """The trainer, or one line that says what it cannot do on this machine."""
+    make = build(node, "trainer", within="lightning.pytorch")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     try:
-        return parts.make_trainer(
-            default_root_dir=run,
-            logger=logger,
-            callbacks=[*parts.callbacks, record],
-            plugins=WholeFileIO(),
-        )
+        return make(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
     except (ValueError, TypeError, MisconfigurationException) as error:
-        raise SdfhubError(f"trainer: {error}") from error
+        raise SdfhubError(f"trainer: {error}; trainer=auto takes what this machine has") from error
 
 
 def main() -> None:
