@@ -90,9 +90,9 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         raise SdfhubError(
             f"{path}: there is no such checkpoint; a run keeps checkpoints/last.ckpt"
         ) from error
-    except Exception as error:  # torch names a dozen kinds of damage
-        detail = (str(error).splitlines() or [""])[0]
-        raise SdfhubError(f"{path}: not a readable checkpoint of an auto-decoder: {detail}") from error
+    except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
+        kind = type(error).__name__
+        raise SdfhubError(f"{path}: not a readable checkpoint of an auto-decoder ({kind})") from error
     return weights
 
 

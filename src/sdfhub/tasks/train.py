@@ -11,6 +11,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
+from torch import Tensor
 
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
@@ -32,6 +33,7 @@ class Parts:
     trainer: Trainer
     record: TrainingRecord
     resume_from: Path | None
+    weights: dict[str, Tensor] | None
 
 
 def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
@@ -44,6 +46,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     prepared = prepare_data(config["data"])
     loader = parts.make_loader(shapes=prepared.train)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
+    if parts.weights:
+        put_weights(model, parts.weights, parts.resume_from)
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
@@ -70,14 +74,11 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     """
     config["seed"] = check(config["seed"], int, "seed")
     resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
-    weights = read_weights(resume_from) if resume_from else None
     every = {
         key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
     }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
-    if weights:
-        put_weights(model, weights, resume_from)
+    build_autodecoder(config, rows=1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
     return Parts(
@@ -86,6 +87,7 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
         trainer=build_trainer(config["trainer"], run, callbacks),
         record=record,
         resume_from=resume_from,
+        weights=read_weights(resume_from) if resume_from else None,
     )
 
 
