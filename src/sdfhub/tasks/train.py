@@ -105,6 +105,7 @@ def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
+    warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
         train(plain(config), Path(HydraConfig.get().runtime.output_dir))
