@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from sdfhub.data.procedural import CATEGORIES, design, generate
 from sdfhub.errors import SdfhubError
 
-SAMPLE = range(0, 96, 8)
+SAMPLE = [*range(0, 96, 8), 69]  # 69: a Chesterfield on tapered legs
 
 
 @pytest.fixture(scope="module")

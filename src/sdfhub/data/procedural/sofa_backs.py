@@ -29,21 +29,19 @@ def _lean(sofa, z):
     return sofa.back_lean * np.clip((z - sofa.seat_height) / sofa.back_height, 0, None)
 
 
-def _wall(
-    sofa, x: np.ndarray, top: np.ndarray, push: np.ndarray | float = 0.0, radius: float = 0.045
-) -> Manifold:
+def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Manifold:
     """A leaning wall with rounded top and ends.
 
     Args:
         sofa: whose back it is.
         x: [K] increasing stations from the left end to the right.
         top: [K] heights there.
-        push: [K] how far the front swells towards -y.
-        radius: of the rounding.
+        push: how far the front swells towards -y: one number, [K] numbers, or a function of (x, heights).
+        rows: of facets on the front.
     """
-    push = np.broadcast_to(push, x.shape)
+    swelling = push if callable(push) else lambda s, z: np.interp(s, x, np.broadcast_to(push, x.shape))
     thick, low = sofa.back_thickness, sofa.leg_height
-    r = min(radius, 0.45 * thick)
+    r = min(0.045, 0.45 * thick)
     turn = np.linspace(0, np.pi / 2, 5)
     ends = r * (1 - np.sin(turn[:-1]))  # inset of the wall where it rounds off
     left = x[0] + r * (1 - np.cos(turn[:-1]))
@@ -52,11 +50,11 @@ def _wall(
     inset = np.concatenate([ends, np.zeros(inside.sum()), ends[::-1]])
     sections = []
     for s, cut in zip(stations, inset, strict=True):
-        high, swell = np.interp(s, x, top) - cut, np.interp(s, x, push)
-        front = np.linspace(low, high - r, 8)
-        t = np.concatenate([np.full(8, cut), cut + r * (1 - np.cos(turn[1:]))])
+        high = np.interp(s, x, top) - cut
+        front = np.concatenate([[low], np.linspace(sofa.deck, high - r, rows)])
+        t = np.concatenate([np.full(rows + 1, cut), cut + r * (1 - np.cos(turn[1:]))])
         z = np.concatenate([front, high - r + r * np.sin(turn[1:])])
-        t = t - swell * np.clip((high - z) / 0.1, 0, 1) ** 0.5
+        t = t - swelling(s, z) * np.clip((high - z) / 0.1, 0, 1) ** 0.5
         back_t = np.concatenate([thick - cut - r + r * np.cos(turn[::-1]), [thick - cut] * 2])
         back_z = np.concatenate([high - r + r * np.sin(turn[::-1]), [sofa.seat_height, low]])
         t, z = np.concatenate([t, back_t]), np.concatenate([z, back_z])
@@ -94,20 +92,16 @@ def _camel(sofa) -> list[Manifold]:
 
 
 def _tufted(sofa) -> list[Manifold]:
-    """A tight back whose front is drawn in by buttons in a diamond pattern."""
-    step = 0.95 * sofa.channel_width
-    half = sofa.half_seat - 0.07
-    depth = 0.035
-    wall = _wall(sofa, *_level(sofa, 3))
-    dents = []
-    heights = np.arange(sofa.seat_height + 0.1, sofa.seat_height + sofa.back_height - 0.05, 0.6 * step)
-    for row, z in enumerate(heights):
-        count = max(2, round(2 * half / step)) - row % 2
-        shift = half - (row % 2) * half / max(2, round(2 * half / step))
-        for x in np.linspace(-shift, shift, max(count, 1) + 1 - 0):
-            y = sofa.seat_depth / 2 + _lean(sofa, z)
-            dents.append(parts.ellipsoid((0.4 * step, depth, 0.34 * step), (x, y, z), 12))
-    return [wall - parts.union(dents)]
+    """A tight back drawn in along the diagonals, so that diamonds of stuffing stand out."""
+    step = 2 * sofa.half_seat / max(2, round(2 * sofa.half_seat / sofa.channel_width))
+
+    def diamonds(x: float, z: np.ndarray) -> np.ndarray:
+        u, v = x / step, (z - sofa.seat_height) / (1.15 * step)
+        inner = np.clip((sofa.half_seat - abs(x)) / 0.05, 0, 1)
+        return 0.055 * inner * np.abs(np.sin(np.pi * (u + v)) * np.sin(np.pi * (u - v))) ** 0.5
+
+    x, top = _level(sofa, 6 * max(4, round(2 * _half(sofa) / step)) + 1)
+    return [_wall(sofa, x, top, diamonds, 22)]
 
 
 def _cushions(sofa) -> list[Manifold]:
@@ -128,21 +122,20 @@ def _cushions(sofa) -> list[Manifold]:
 
 def _chesterfield(sofa) -> list[Manifold]:
     """Arms and back of one height: an upright and a roll along its top, round the corners."""
-    roll = 0.4 * sofa.arm_width + 0.03
-    thick = 0.8 * sofa.arm_width
-    x, front, rear = sofa.half_seat + thick / 2, sofa.front + 0.012, sofa.rear - thick / 2
-    top = sofa.seat_height + sofa.arm_height + 0.1
-    corner = 0.14 + 0.5 * sofa.hump
-    plan = [(-x, front, 0), (-x, rear, 0), (x, rear, 0), (x, front, 0)]
-    path = parts.filleted(plan, corner, 8)
-    middle = (sofa.leg_height + top - roll) / 2
-    tall = top - roll - sofa.leg_height
-    section = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * np.array([thick, tall]) / 2
-    wall = parts.sweep(path + [0, 0, middle], section)
-    bead = parts.tube(path + [0, 0, top - roll], roll, 24)
-    deck = sofa.deck
-    fill = parts.box(
-        (2 * sofa.half_seat, sofa.back_thickness + 0.1, deck - sofa.leg_height - 0.02),
-        (0, rear - sofa.back_thickness / 2 - 0.05, (deck + sofa.leg_height) / 2),
-    )
-    return [parts.union([wall, bead]), fill]
+    thick, radius = upright(sofa), 0.4 * sofa.arm_width + 0.03
+    x, rear = sofa.half_seat + thick / 2, sofa.rear - thick / 2
+    axis, low = sofa.seat_height + sofa.arm_height + 0.1 - radius, sofa.leg_height
+    plan = [(-x, sofa.front, 0), (-x, rear, 0), (x, rear, 0), (x, sofa.front, 0)]
+    path = parts.filleted(plan, corner(sofa), 8) + [0, 0, axis]
+    section = np.array([(-thick / 2, low - axis), (thick / 2, low - axis), (thick / 2, 0), (-thick / 2, 0)])
+    return [parts.sweep(path, section), parts.tube(path, radius, 24)]
+
+
+def upright(sofa) -> float:
+    """Thickness of the Chesterfield's wall."""
+    return 0.8 * sofa.arm_width
+
+
+def corner(sofa) -> float:
+    """How far from its corners the Chesterfield's wall begins to turn."""
+    return 0.14 + 0.5 * sofa.hump

@@ -6,7 +6,7 @@ from manifold3d import Manifold
 from sdfhub.data.procedural import parts
 
 
-def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps: int = 4) -> Manifold:
+def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps: int = 3) -> Manifold:
     """A stuffed block whose +z side swells.
 
     Args:
@@ -50,7 +50,7 @@ def seats(sofa) -> list[Manifold]:
         del reach
     made = []
     for left, right, front in placed:
-        rear, low = sofa.seat_depth / 2 + 0.04, sofa.deck - 0.6 * sofa.cushion_radius
+        rear, low = sofa.back_face + sofa.cushion_radius + 0.012, sofa.deck - 0.6 * sofa.cushion_radius
         size = (right - left, rear - front, sofa.seat_height - low)
         centre = ((left + right) / 2, (front + rear) / 2, (low + sofa.seat_height) / 2)
         made.append(cushion(size, centre, sofa.cushion_radius, sofa.crown))
@@ -61,7 +61,7 @@ def loose(sofa) -> list[Manifold]:
     """Throw pillows that lean on the back, or a bolster along each arm."""
     if sofa.pillows == "none":
         return []
-    back = sofa.seat_depth / 2 - (0.5 * sofa.back_thickness if sofa.back == "cushions" else 0.0)
+    back = sofa.back_face - (0.5 * sofa.back_thickness if sofa.back == "cushions" else 0.0)
     if sofa.pillows == "bolsters":
         return _bolsters(sofa, back)
     size = sofa.pillow_size

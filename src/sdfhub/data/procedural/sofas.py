@@ -72,6 +72,11 @@ class Sofa:
         return self.seat_depth / 2 + self.back_thickness
 
     @property
+    def back_face(self) -> float:
+        """y of the back's front where it meets the seat."""
+        return self.rear - sofa_backs.upright(self) if self.back == "chesterfield" else self.seat_depth / 2
+
+    @property
     def deck(self) -> float:
         """Height of the board that carries the seat cushions."""
         return self.seat_height - self.cushion_height
@@ -87,7 +92,8 @@ class Sofa:
 
     def _frame(self) -> list[Manifold]:
         """The upholstered box below the cushions."""
-        made = [self._slab(-self.half_seat, self.half_seat, self.front + 0.014, self.rear - 0.012)]
+        rear = self.rear - (0.5 * sofa_backs.upright(self) if self.back == "chesterfield" else 0.012)
+        made = [self._slab(-self.half_seat, self.half_seat, self.front + 0.014, rear)]
         if span := self.chaise_span():
             front = self.front - self.chaise_length
             made.append(self._slab(*span, front + 0.014, self.front + 0.2))
@@ -160,9 +166,13 @@ class Sofa:
 
     def _corners(self) -> list[np.ndarray]:
         """[2] outer corners of what stands on the floor: pairs from left to right."""
-        x = self.half_width
-        columns = [-x, x] if 2 * x < 1.9 else [-x, 0.0, x]
-        made = [np.array([c, y]) for c in columns for y in (self.front, self.rear)]
+        x, tuck = self.half_width, 0.0
+        middle = [] if x < 0.95 else [0.0]
+        if self.back == "chesterfield":  # its corners are round
+            x, tuck = self.half_seat + sofa_backs.upright(self), 0.3 * sofa_backs.corner(self)
+        made = [np.array([c, self.front]) for c in (-x, *middle, x)]
+        behind = [(tuck - x, tuck), *((c, 0.0) for c in middle), (x - tuck, tuck)]
+        made += [np.array([c, self.rear - inset]) for c, inset in behind]
         if span := self.chaise_span():
             made += [np.array([c, self.front - self.chaise_length]) for c in span]
         return made
@@ -171,7 +181,10 @@ class Sofa:
         if self.legs == "sled":
             return self._sled()
         if self.legs == "plinth":
-            made = [self._slab(-self.half_width, self.half_width, self.front, self.rear, 0.0)]
+            x, rear = self.half_width, self.rear
+            if self.back == "chesterfield":
+                x, rear = self.half_seat + 0.02, rear - 0.5 * sofa_backs.upright(self)
+            made = [self._slab(-x, x, self.front, rear, 0.0)]
             if span := self.chaise_span():
                 made.append(self._slab(*span, self.front - self.chaise_length, self.front + 0.2, 0.0))
             return made
@@ -181,7 +194,7 @@ class Sofa:
         w, z = self.leg_width, self.leg_height + 0.025
         inset = 0.05 + 0.5 * w
         towards = np.array([np.sign(corner[0]), 1.0 if corner[1] > 0 else -1.0])
-        if abs(corner[0]) < self.half_width - 1e-9 and corner[1] < self.front - 1e-9:
+        if corner[1] < self.front - 1e-9:
             left, right = self.chaise_span()
             towards[0] = 1.0 if corner[0] > (left + right) / 2 else -1.0
         top = np.array([*(corner - inset * towards), z])
