@@ -228,7 +228,8 @@ def ball_batches():
 @pytest.mark.parametrize(("activation", "encoding", "normals"), COMBINATIONS)
 def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
     config = composed(f"activation={activation}", f"encoding={encoding}", f"normals={normals}")
-    module = build_autodecoder(config, rows=4, steps=30)
+    # the schedule of a whole run at scale=cpu, of which these are the first steps
+    module = build_autodecoder(config, rows=4, steps=4500)
     config["trainer"]["max_epochs"] = 1
     losses = []
 
@@ -239,7 +240,7 @@ def test_every_combination_lowers_its_loss_from_its_defaults(activation, encodin
     trainer = L.Trainer(
         accelerator="cpu",
         max_epochs=1,
-        limit_train_batches=30,
+        limit_train_batches=60,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -247,10 +248,10 @@ def test_every_combination_lowers_its_loss_from_its_defaults(activation, encodin
         use_distributed_sampler=False,
         callbacks=[Keep()],
     )
-    steps = torch.utils.data.DataLoader(ball_batches, sampler=range(30), batch_size=None)
+    steps = torch.utils.data.DataLoader(ball_batches, sampler=range(60), batch_size=None)
     trainer.fit(module, steps)
     assert all(torch.isfinite(torch.tensor(losses)))
-    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+    assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
 
 
 def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path):
@@ -306,7 +307,7 @@ def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tm
         folder.mkdir(parents=True, exist_ok=True)
         np.savez(folder / f"ball{index}.npz", **sides)
     common = [
-        *TINY,
+        *(setting for setting in TINY if not setting.startswith("normals")),
         "data=deepsdf",
         f"data.source.root={tmp_path / 'SdfSamples'}",
         "data.shapes=2",
