@@ -11,7 +11,7 @@ from sdfhub.data.datamodule import Augmentation, EpochSteps, StepBatches, wrappi
 from sdfhub.errors import SdfhubError
 from sdfhub.model.fitting import MapFit
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term, spatial_gradient
-from sdfhub.model.optim import Adam, Constant, Cosine, StepDecay
+from sdfhub.model.optim import Adam, Cosine, StepDecay
 from sdfhub.shapes import Batch
 from tests.test_model import small_decoder
 
@@ -89,17 +89,24 @@ def test_step_schedule_halves_every_500_of_2000_epochs():
     assert [schedule(epoch / 2000) for epoch in (0, 499, 500, 1000, 1999)] == [1, 1, 0.5, 0.25, 0.125]
 
 
-def test_cosine_schedule_rises_then_falls_to_its_end():
-    schedule = Cosine(warmup=0.1, final=0.01)
-    assert schedule(0.05) == pytest.approx(0.5)
-    assert schedule(0.1) == pytest.approx(1)
+def test_cosine_schedule_falls_from_one_to_its_end():
+    schedule = Cosine(final=0.01)
+    assert schedule(0.0) == pytest.approx(1)
+    assert schedule(0.5) == pytest.approx((1 + 0.01) / 2)
     assert schedule(1.0) == pytest.approx(0.01)
-    assert schedule(0.55) == pytest.approx((1 + 0.01) / 2)
+
+
+@pytest.mark.parametrize(("steps", "reached"), [(1000, 100), (60, 30)])
+def test_warm_up_is_counted_in_steps_but_takes_no_more_than_half_of_training(steps, reached):
+    optim = Adam(1e-3, 1e-2, Cosine(final=1.0), warmup_steps=100)
+    assert optim.factor(0, steps) == pytest.approx(1 / reached)
+    assert optim.factor(reached - 2, steps) < 1
+    assert optim.factor(reached - 1, steps) == optim.factor(steps, steps) == 1
 
 
 def test_each_group_has_its_own_learning_rate():
     decoder, codes = torch.nn.Parameter(torch.ones(2)), torch.nn.Parameter(torch.ones(2))
-    optimizer, _ = Adam(1e-3, 1e-2, Constant()).configure([decoder], [codes], steps=10)
+    optimizer, _ = Adam(1e-3, 1e-2, Cosine()).configure([decoder], [codes], steps=10)
     assert {group["name"]: group["lr"] for group in optimizer.param_groups} == {
         "decoder": 1e-3,
         "codes": 1e-2,

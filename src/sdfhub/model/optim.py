@@ -16,14 +16,6 @@ class Schedule(Protocol):
 
 
 @dataclass(frozen=True)
-class Constant:
-    """The same learning rate from start to end."""
-
-    def __call__(self, progress: float) -> float:
-        return 1.0
-
-
-@dataclass(frozen=True)
 class StepDecay:
     """Multiplied by `factor` after each `every` of training (DeepSDF: halved every 500 of 2000 epochs).
 
@@ -46,25 +38,20 @@ class StepDecay:
 
 @dataclass(frozen=True)
 class Cosine:
-    """Half a cosine from 1 to `final`, after a linear rise over `warmup`.
+    """Half a cosine from 1 to `final`.
 
     Args:
-        warmup: share of training that rises, in [0, 1).
         final: factor at the end, in [0, 1].
     """
 
-    warmup: float = 0.0
     final: float = 0.0
 
     def __post_init__(self):
-        if not (0 <= self.warmup < 1 and 0 <= self.final <= 1):
-            raise ValueError("schedule: warmup must be in [0, 1) and final in [0, 1]")
+        if not 0 <= self.final <= 1:
+            raise ValueError("schedule: final must be in [0, 1]")
 
     def __call__(self, progress: float) -> float:
-        if progress < self.warmup:
-            return progress / self.warmup
-        share = (progress - self.warmup) / (1 - self.warmup)
-        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -75,13 +62,19 @@ class Adam:
         lr_decoder: initial learning rate of the decoder, > 0.
         lr_codes: initial learning rate of the codes, > 0.
         schedule: factor of both over the share of training.
+        warmup_steps: over which both first rise from 0; no more than half of training. Counted in steps, not
+            as a share: a short training needs it as much as a long one, or its first steps throw the field
+            out of [-delta, delta], where the clamped loss has no gradient.
     """
 
     lr_decoder: float
     lr_codes: float
     schedule: Schedule
+    warmup_steps: int = 0
 
     def __post_init__(self):
+        if self.warmup_steps < 0:
+            raise ValueError("optim: warmup_steps must be 0 or more")
         if min(self.lr_decoder, self.lr_codes) <= 0:
             raise ValueError("optim: lr_decoder and lr_codes must be positive")
 
@@ -94,5 +87,10 @@ class Adam:
             {"params": list(codes), "lr": self.lr_codes, "name": "codes"},
         ]
         optimizer = torch.optim.Adam(groups, fused=True)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.schedule(step / steps))
-        return optimizer, schedule
+        return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.factor(step, steps))
+
+    def factor(self, step: int, steps: int) -> float:
+        """What multiplies both learning rates at `step`, counted from 0, of `steps`."""
+        warmup = min(self.warmup_steps, steps // 2)
+        rise = min(1.0, (step + 1) / warmup) if warmup else 1.0
+        return rise * self.schedule(step / steps)

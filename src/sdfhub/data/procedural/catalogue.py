@@ -7,7 +7,7 @@ from sdfhub.data.procedural import chairs, lamps, planes, sofas, tables
 from sdfhub.data.procedural.parameters import draw
 from sdfhub.errors import SdfhubError
 
-VERSION = 2
+VERSION = 3
 """Raised whenever a generator changes what it makes; stores hash it."""
 
 _DESIGNS = {

@@ -11,6 +11,7 @@ from sdfhub.data.procedural.parameters import choice, continuous
 
 _HEIGHT = {"floor": 1.5, "table": 0.56, "desk": 0.52, "arc": 1.8, "tripod": 1.45, "pendant": 0.8}
 _SHADE = {"floor": 0.3, "table": 0.6, "desk": 0.36, "arc": 0.27, "tripod": 0.37, "pendant": 0.58}
+_STURDY = {"desk": 1.1, "arc": 1.2}  # where reach makes the lamp large against its height
 _BASE = {"floor": 0.22, "table": 0.36, "desk": 0.38, "arc": 0.24, "tripod": 0.3, "pendant": 0.18}
 
 
@@ -53,16 +54,20 @@ class Lamp:
 
     def gauge(self) -> float:
         """Radius of the stem; it follows the lamp's size, so that no wire gets lost."""
-        return self.stem * 0.55 * self.tall()
+        return self.stem * 0.55 * self.tall() * self._sturdiness()
 
     def wall_thickness(self) -> float:
         """Of the shade."""
-        return self.wall * 0.56 * self.tall()
+        return self.wall * 0.56 * self.tall() * self._sturdiness()
 
     def shade_diameter(self) -> float:
         """Of the shade at its widest."""
         few = 0.62 if self.kind == "pendant" and self.lights > 1 else 1.0
         return few * _SHADE[self.kind] * self.shade_width * self.tall()
+
+    def _sturdiness(self) -> float:
+        """Factor on what is thin: thinner than 0.015 of the bounding radius it could not be sampled."""
+        return 1.4 if self.kind == "pendant" and self.lights > 1 else _STURDY.get(self.kind, 1.0)
 
     def _foot(self) -> float:
         return _BASE[self.kind] * self.base_width * self.tall() / 2

@@ -64,10 +64,10 @@ class Fuselage:
         """Height of the roof at y."""
         return self.axis(y) + self.half_height(y)
 
-    def solid(self, segments: int = 28) -> Manifold:
+    def solid(self, segments: int = 24) -> Manifold:
         """The body, its nose and tail closed by small discs."""
-        stretch = np.linspace(0.06, 1, 12) ** 2
-        nose, tail = -0.5 + self.nose * stretch, 0.5 - self.tail * np.linspace(1, 0, 14)
+        stretch = np.linspace(0.07, 1, 10) ** 2
+        nose, tail = -0.5 + self.nose * stretch, 0.5 - self.tail * np.linspace(1, 0, 11)
         body = [self._ring(y, segments) for y in (*nose, *tail[tail > nose[-1] + 0.005])]
         cap = self._ring(0.5, segments)
         centre = cap.mean(0)
@@ -223,9 +223,9 @@ def canopy(front: float, back: float, peak: float, base, half_width: float, heig
         half_width: at the peak.
         height: above the base.
     """
-    unit = superellipse(20, 2.4)
+    unit = superellipse(16, 2.4)
     sections = []
-    for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 14))) / 2:
+    for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 11))) / 2:
         side = (peak - t) / peak if t < peak else (t - peak) / (1 - peak)
         rise = (1 - side**2) ** 0.62
         y = front + t * (back - front)

@@ -70,7 +70,7 @@ def _level(sofa, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tight(sofa) -> list[Manifold]:
-    x, top = _level(sofa, 41)
+    x, top = _level(sofa, 25)
     inner = np.clip(1 - (x / sofa.half_seat) ** 6, 0, 1)
     return [_wall(sofa, x, top, 0.5 * sofa.crown * inner)]
 
@@ -78,14 +78,14 @@ def _tight(sofa) -> list[Manifold]:
 def _channels(sofa) -> list[Manifold]:
     """Vertical rolls side by side."""
     count = max(3, round(2 * _half(sofa) / sofa.channel_width))
-    x, top = _level(sofa, 8 * count + 1)
-    wave = np.abs(np.sin(np.pi * np.arange(8 * count + 1) / 8))
+    x, top = _level(sofa, 6 * count + 1)
+    wave = np.abs(np.sin(np.pi * np.arange(6 * count + 1) / 6))
     return [_wall(sofa, x, top + 0.012 * wave, 0.06 * wave**0.7 - 0.01)]
 
 
 def _camel(sofa) -> list[Manifold]:
     """A top that rises to a hump in the middle and sweeps up again to the ends."""
-    x, top = _level(sofa, 61)
+    x, top = _level(sofa, 41)
     u = x / x[-1]
     rise = np.exp(-((u / 0.42) ** 2)) + 0.25 * u**6
     return [_wall(sofa, x, top - 0.06 + sofa.hump * rise)]
@@ -101,7 +101,7 @@ def _tufted(sofa) -> list[Manifold]:
         return 0.055 * inner * np.abs(np.sin(np.pi * (u + v)) * np.sin(np.pi * (u - v))) ** 0.5
 
     x, top = _level(sofa, 6 * max(4, round(2 * _half(sofa) / step)) + 1)
-    return [_wall(sofa, x, top, diamonds, 22)]
+    return [_wall(sofa, x, top, diamonds, 18)]
 
 
 def _cushions(sofa) -> list[Manifold]:

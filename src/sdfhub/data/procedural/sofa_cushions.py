@@ -18,7 +18,7 @@ def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps:
         steps: facets per quarter of a circle.
     """
     block = parts.rounded_box(size, (0, 0, 0), radius, steps)
-    u, v = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-0.94, 0.94, 9)], indexing="ij"))
+    u, v = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-0.94, 0.94, 7)], indexing="ij"))
     inner = np.asarray(size) / 2 - [0.6 * radius, 0.6 * radius, 0]
     swell = inner[2] + crown * ((1 - u**2) * (1 - v**2)) ** 0.6
     points = np.column_stack([u * inner[0], v * inner[1], swell])
