@@ -148,6 +148,52 @@ def test_first_and_second_derivatives_are_right(activation, encoding):
     assert torch.autograd.gradgradcheck(decoder, (points, codes))
 
 
+@pytest.mark.parametrize("settings", [{}, {"tanh": True}, {"inject_encoding": [1, 2], "inject_code": [1]}])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_written_out_gradient_equals_autograds_and_so_do_its_derivatives(activation, encoding, settings):
+    """The fast path against its plain twin, a double backward, in double precision."""
+    decoder = small_decoder(ACTIVATIONS[activation], ENCODINGS[encoding](), **settings).double()
+    with torch.no_grad():
+        for parameter in decoder.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+    points = torch.rand(2, 7, 3, dtype=torch.double) * 1.6 - 0.8
+    codes = torch.randn(2, 4, dtype=torch.double, requires_grad=True)
+    learned = [*decoder.parameters(), codes]
+
+    def objective(values, gradients):
+        return (values.square().sum() + (gradients - 0.3).pow(4).sum(),)
+
+    values, gradients = decoder.value_and_gradient(points, codes)
+    derivatives = torch.autograd.grad(objective(values, gradients), learned, allow_unused=True)
+
+    leaf = points.clone().requires_grad_()
+    plain = decoder(leaf, codes)
+    (plain_gradients,) = torch.autograd.grad(plain.sum(), leaf, create_graph=True)
+    plain_derivatives = torch.autograd.grad(objective(plain, plain_gradients), learned, allow_unused=True)
+
+    assert torch.allclose(values, plain, atol=1e-12)
+    assert torch.allclose(gradients, plain_gradients, atol=1e-10)
+    for ours, theirs in zip(derivatives, plain_derivatives, strict=True):
+        assert (ours is None) == (theirs is None)
+        assert ours is None or torch.allclose(ours, theirs, atol=1e-9, rtol=1e-9)
+
+
+def test_written_out_gradient_meets_the_same_dropped_units_as_its_values():
+    decoder = small_decoder(dropout=0.5).double()
+    torch.manual_seed(3)
+    points = (torch.rand(1, 1, 3, dtype=torch.double) - 0.5).requires_grad_()
+    codes = torch.randn(1, 4, dtype=torch.double)
+    torch.manual_seed(5)
+    values, gradients = decoder.value_and_gradient(points, codes)
+    for axis in range(3):
+        moved = points.detach().clone()
+        moved[..., axis] += 1e-6
+        torch.manual_seed(5)
+        slope = (decoder.value_and_gradient(moved, codes)[0] - values) / 1e-6
+        assert torch.allclose(slope, gradients[..., axis], atol=1e-4)
+
+
 def test_deepsdf_has_its_published_number_of_parameters():
     decoder = Decoder(Identity(), Relu, 256, 8, 512, [4], [4], dropout=0.2, tanh=True)
     assert parameters(decoder) == 1_843_195

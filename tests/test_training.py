@@ -10,7 +10,7 @@ import torch
 from sdfhub.data.datamodule import Augmentation, EpochSteps, StepBatches, wrapping_slice
 from sdfhub.errors import SdfhubError
 from sdfhub.model.fitting import MapFit
-from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term, spatial_gradient
+from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
 from sdfhub.model.optim import Adam, Cosine, StepDecay
 from sdfhub.shapes import Batch
 from tests.test_model import small_decoder
@@ -55,16 +55,6 @@ def test_code_prior_is_the_papers_square_or_deepsdfs_norm():
 def test_normal_term_is_the_mean_squared_difference():
     gradients, normals = torch.zeros(1, 2, 3), torch.tensor([[[1.0, 0, 0], [0, 2.0, 0]]])
     assert normal_term(gradients, normals) == 2.5
-
-
-def test_spatial_gradient_of_a_known_field_and_its_way_to_the_weights():
-    weight = torch.tensor(2.0, requires_grad=True)
-    points = torch.rand(2, 5, 3)
-    values, gradients = spatial_gradient(lambda x: weight * x.square().sum(-1), points)
-    assert torch.allclose(values, 2 * points.square().sum(-1))
-    assert torch.allclose(gradients, 4 * points)
-    gradients.sum().backward()
-    assert torch.isclose(weight.grad, (2 * points).sum())
 
 
 def test_prior_warms_up_and_parts_add_their_weights():

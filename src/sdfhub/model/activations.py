@@ -1,7 +1,8 @@
 """Nonlinearities of the decoder, one instance per hidden layer.
 
-Each rival is a module with two duties: `forward`, and `weight_bound`, the half-width of the uniform
-distribution from which the weights of the linear layer before it are drawn.
+Each rival is a module with three duties: `forward`; `with_slope`, the same beside its derivative, from which
+the decoder computes spatial gradients; and `weight_bound`, the half-width of the uniform distribution from
+which the weights of the linear layer before it are drawn.
 """
 
 import math
@@ -23,6 +24,10 @@ class Activation(nn.Module, ABC):
         self.first = first
 
     @abstractmethod
+    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """a(x) and a'(x), both shaped like x and both differentiable."""
+
+    @abstractmethod
     def weight_bound(self, fan_in: int) -> float:
         """Half-width b of U(-b, b), the initial weights of the layer before, for `fan_in` inputs."""
 
@@ -39,6 +44,9 @@ class Relu(Activation):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.relu(x)
+
+    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.relu(x), (x > 0).to(x.dtype)
 
 
 class Siren(Activation):
@@ -63,6 +71,10 @@ class Siren(Activation):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.sin(self.omega * x)
+
+    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        angle = self.omega * x
+        return torch.sin(angle), self.omega * torch.cos(angle)
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega}
@@ -99,6 +111,11 @@ class Hosc(Siren):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.tanh(self.beta * torch.sin(self.omega * x))
+
+    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        sine, slope = super().with_slope(x)
+        wave = torch.tanh(self.beta * sine)
+        return wave, self.beta * slope * (1 - wave * wave)
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega, "beta": self.beta.item()}

@@ -9,7 +9,7 @@ from torch import Tensor
 from sdfhub.errors import SdfhubError
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.losses import SdfLoss, spatial_gradient
+from sdfhub.model.losses import SdfLoss
 from sdfhub.model.optim import Adam
 from sdfhub.shapes import Batch
 
@@ -51,7 +51,7 @@ class AutoDecoder(L.LightningModule):
         predicted = self.decoder(batch.points, codes)
         gradients = None
         if batch.surface_points.shape[1] and self.loss.wants_gradients(self.progress):
-            _, gradients = spatial_gradient(lambda x: self.decoder(x, codes), batch.surface_points)
+            _, gradients = self.decoder.value_and_gradient(batch.surface_points, codes)
         epoch = self.global_step / max(self.trainer.num_training_batches, 1)
         parts = self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
         loss = torch.stack(tuple(parts.values())).sum()

@@ -41,6 +41,11 @@ class Layer(nn.Module):
                 shift = shift + F.linear(encoded, from_encoding)
         return F.linear(inputs, weight) + shift
 
+    def pullback(self, cotangent: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's."""
+        parts = self.linear.weight.split(self.columns, dim=1)[:2]
+        return tuple(cotangent @ part if part.shape[1] else None for part in parts)
+
 
 class Decoder(nn.Module):
     """Signed distances of B shapes at N points each.
@@ -124,3 +129,33 @@ class Decoder(nn.Module):
                 hidden = F.dropout(hidden, self.dropout, self.training)
         sdf = self.layers[-1](hidden, encoded, codes).squeeze(-1)
         return torch.tanh(sdf) if self.tanh else sdf
+
+    def value_and_gradient(self, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distances [B, N] and their spatial gradients [B, N, 3] at points [B, N, 3].
+
+        The chain rule is written out as one more pass through the layers, so that a loss of the gradient
+        is differentiated once, like any other, and the whole compiles.
+
+        Args:
+            points: normalised frame.
+            codes: [B, L].
+        """
+        encoded, to_space = self.encoding.with_pullback(points)
+        hidden, slopes = None, []
+        for layer, activation in zip(self.layers, self.activations, strict=False):
+            hidden, slope = activation.with_slope(layer(hidden, encoded, codes))
+            if self.dropout and self.training:
+                kept = F.dropout(torch.ones_like(hidden), self.dropout)
+                hidden, slope = hidden * kept, slope * kept
+            slopes.append(slope)
+        sdf = self.layers[-1](hidden, encoded, codes)
+        cotangent = torch.ones_like(sdf)
+        if self.tanh:
+            sdf = torch.tanh(sdf)
+            cotangent = 1 - sdf * sdf
+        by_encoding = torch.zeros_like(encoded)
+        for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
+            by_hidden, part = layer.pullback(cotangent)
+            by_encoding = by_encoding if part is None else by_encoding + part
+            cotangent = None if slope is None else by_hidden * slope
+        return sdf.squeeze(-1), to_space(by_encoding)

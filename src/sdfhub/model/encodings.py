@@ -1,11 +1,13 @@
 """Positional encodings gamma(x): points [..., 3] in the unit ball become features [..., F].
 
 Every rival is a module with an attribute `features` (F) and a `forward` that can be differentiated twice,
-because the normal loss differentiates the field's spatial gradient by the weights.
+because the normal loss differentiates the field's spatial gradient by the weights. Where the Jacobian has a
+short formula, `with_pullback` states it; the others inherit one that asks autograd.
 """
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +29,21 @@ class Encoding(nn.Module, ABC):
     def forward(self, points: Tensor) -> Tensor:
         """Encodes points [..., 3], normalised frame, as [..., F]."""
 
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, "Pullback"]:
+        """Features [..., F] and the map of a cotangent v [..., F] to J(x)^T v [..., 3], differentiable."""
+        with torch.enable_grad():
+            points = points.detach().requires_grad_()
+            features = self(points)
+
+        def pullback(cotangent: Tensor) -> Tensor:
+            return torch.autograd.grad(features, points, cotangent, create_graph=True)[0]
+
+        return features, pullback
+
+
+Pullback = Callable[[Tensor], Tensor]
+"""What a cotangent of features is in space: [..., F] -> [..., 3]."""
+
 
 class Identity(Encoding):
     """The coordinates themselves: F = 3."""
@@ -35,6 +52,9 @@ class Identity(Encoding):
 
     def forward(self, points: Tensor) -> Tensor:
         return points
+
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        return points, lambda cotangent: cotangent
 
 
 class Fourier(Encoding):
@@ -60,6 +80,18 @@ class Fourier(Encoding):
         waves = [torch.sin(angles), torch.cos(angles)]
         return torch.cat([points, *waves] if self.include_points else waves, dim=-1)
 
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        features = self(points)
+        sine, cosine = features[..., 3 * self.include_points :].chunk(2, dim=-1)
+
+        def pullback(cotangent: Tensor) -> Tensor:
+            by_sine, by_cosine = cotangent[..., 3 * self.include_points :].chunk(2, dim=-1)
+            by_angle = by_sine * cosine - by_cosine * sine
+            by_point = by_angle.unflatten(-1, (3, -1)) @ self.octaves
+            return by_point + cotangent[..., :3] if self.include_points else by_point
+
+        return features, pullback
+
 
 class Gaussian(Encoding):
     """sin(2 pi B x) and cos(2 pi B x) with rows of B drawn once from N(0, sigma^2): F = 2 rows.
@@ -81,6 +113,16 @@ class Gaussian(Encoding):
     def forward(self, points: Tensor) -> Tensor:
         angles = 2 * math.pi * points @ self.directions.T
         return torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
+
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        features = self(points)
+        sine, cosine = features.chunk(2, dim=-1)
+
+        def pullback(cotangent: Tensor) -> Tensor:
+            by_sine, by_cosine = cotangent.chunk(2, dim=-1)
+            return 2 * math.pi * (by_sine * cosine - by_cosine * sine) @ self.directions
+
+        return features, pullback
 
 
 class Hash(Encoding):

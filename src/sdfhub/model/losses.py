@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 
@@ -99,19 +98,3 @@ class SdfLoss:
         if gradients is not None:
             parts["normal"] = self.tau * normal_term(gradients, normals)
         return parts
-
-
-def spatial_gradient(field, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Values f [B, M] and spatial gradients [B, M, 3] of a field at points [B, M, 3].
-
-    The gradient stays in the graph of the weights, so a loss of it can be differentiated again.
-
-    Args:
-        field: callable, points [B, M, 3] -> [B, M], each value a function of its own point only.
-        points: normalised frame.
-    """
-    with torch.enable_grad():
-        points = points.detach().requires_grad_()
-        values = field(points)
-        (gradients,) = torch.autograd.grad(values.sum(), points, create_graph=True)
-    return values, gradients
