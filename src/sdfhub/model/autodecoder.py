@@ -47,19 +47,29 @@ class AutoDecoder(L.LightningModule):
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        codes = self.codes(batch.rows)
-        predicted = self.decoder(batch.points, codes)
-        gradients = None
-        if batch.surface_points.shape[1] and self.loss.wants_gradients(self.progress):
-            _, gradients = self.decoder.value_and_gradient(batch.surface_points, codes)
         epoch = self.global_step / max(self.trainer.num_training_batches, 1)
-        parts = self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
+        parts = self.objective(batch, self.progress, epoch)
         loss = torch.stack(tuple(parts.values())).sum()
         if not torch.isfinite(loss):
             raise SdfhubError(self._divergence(parts))
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
-            self._log(batch, parts, loss, codes)
+            self._log(batch, parts, loss)
         return loss
+
+    def objective(self, batch: Batch, progress: float, epoch: float) -> dict[str, Tensor]:
+        """The weighted parts of the loss of a batch; their sum is what a step lowers.
+
+        Args:
+            batch: of training shapes.
+            progress: share of training done, in [0, 1].
+            epoch: epochs done.
+        """
+        codes = self.codes(batch.rows)
+        predicted = self.decoder(batch.points, codes)
+        gradients = None
+        if batch.surface_points.shape[1] and self.loss.wants_gradients(progress):
+            _, gradients = self.decoder.value_and_gradient(batch.surface_points, codes)
+        return self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
 
     @property
     def progress(self) -> float:
@@ -79,11 +89,11 @@ class AutoDecoder(L.LightningModule):
             "lower optim.lr_decoder, activation.omega_0 or activation.beta, or loss.tau"
         )
 
-    def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor, codes: Tensor) -> None:
+    def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
         values = {f"loss/{name}": part.detach() for name, part in parts.items()} | {
             "loss/total": loss.detach()
         }
-        values["codes/norm"] = codes.detach().norm(dim=-1).mean()
+        values["codes/norm"] = self.codes.table[batch.rows].detach().norm(dim=-1).mean()
         for group in self.optimizers().param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
         for index, activation in enumerate(self.decoder.activations):
