@@ -1,4 +1,4 @@
-"""Training steps side by side with DeepSDF's published step: samples a second, and the share of the GEMM limit.
+"""Training steps side by side with DeepSDF's: samples a second, and the share of the GEMM limit.
 
     python benchmarks/training.py [--shapes 4] [--samples 4096] [--rounds 5] [--threads N] [overrides]
 
@@ -117,10 +117,8 @@ class ReferenceStep:
 class OurStep:
     """One step of what a composed config describes, without Lightning's loop around it."""
 
-    def __init__(
-        self, shapes: list[RandomShape], samples: int, surface: int, overrides: list[str], bf16: bool
-    ):
-        config = plain(compose("config", overrides=overrides))
+    def __init__(self, shapes: list[RandomShape], samples: int, surface: int, choice: list[str], bf16: bool):
+        config = plain(compose("config", overrides=choice))
         self.model = build_autodecoder(config, rows=len(shapes), steps=1000)
         self.batches = StepBatches(shapes, len(shapes), samples, surface, Augmentation(), 0)
         configured = self.model.configure_optimizers()
@@ -214,10 +212,9 @@ def report(args: argparse.Namespace, steps: dict[str, object], seconds: dict[str
     """Prints a Markdown table."""
     rows = args.shapes * args.samples
     rate = {dtype: gemm_rate(512, rows, dtype) for dtype in (torch.float32, torch.bfloat16)}
-    print(
-        f"{torch.get_num_threads()} threads, {args.shapes} shapes x {args.samples} samples; GEMM at width 512:"
-    )
-    print(", ".join(f"{str(dtype)[6:]} {value / 1e9:.0f} G operations/s" for dtype, value in rate.items()))
+    print(f"{torch.get_num_threads()} threads, {args.shapes} shapes x {args.samples} samples a step")
+    rates = ", ".join(f"{str(dtype)[6:]} {value / 1e9:.0f}" for dtype, value in rate.items())
+    print(f"GEMM 512 wide, G operations a second: {rates}")
     print("\n| step | samples/s | times DeepSDF | share of the GEMM rate |\n| --- | --- | --- | --- |")
     reference = seconds["DeepSDF, reference"]
     for name, taken in seconds.items():

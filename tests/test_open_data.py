@@ -11,20 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import yaml
 
 from sdfhub.data import fetch
 from sdfhub.data.sources import OpenSource
 from sdfhub.errors import RejectedMesh, SdfhubError
+from tests.categories import CATEGORIES, NAMES, ROOT
 
-ROOT = Path(__file__).parents[1]
 OPEN = ROOT / "data" / "open"
-NAMES = ("chairs", "lamps", "planes", "sofas", "tables")
-CATEGORIES = {
-    name: settings
-    for file in NAMES
-    for name, settings in yaml.safe_load((ROOT / "conf" / "category" / f"{file}.yaml").read_text()).items()
-}
 BALL = trimesh.creation.icosphere(subdivisions=2)
 OBJ = BALL.export(file_type="obj").encode()
 needs_open = pytest.mark.skipif(not OPEN.is_dir(), reason="data/open is not there: run `make data`")

@@ -10,21 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import yaml
 
 from sdfhub.data import procedural
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.sources import DeepSdfSource, FolderSource, OpenSource, ProceduralSource, ShapeNetSource
 from sdfhub.data.store import prepare
 from sdfhub.errors import RejectedMesh, SdfhubError
+from tests.categories import CATEGORIES
 
-ROOT = Path(__file__).parents[1]
-NAMES = ("chairs", "lamps", "planes", "sofas", "tables")
-CATEGORIES = {
-    name: settings
-    for file in NAMES
-    for name, settings in yaml.safe_load((ROOT / "conf" / "category" / f"{file}.yaml").read_text()).items()
-}
 BALL = trimesh.creation.icosphere(subdivisions=2)
 OBJ = BALL.export(file_type="obj").encode()
 
