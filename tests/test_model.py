@@ -117,9 +117,9 @@ def test_gaussian_directions_are_saved():
 def test_hash_interpolates_its_corners_and_has_a_continuous_slope():
     encoding = Hash(levels=1, width=1, log2_table=10, coarsest=4, finest=4, include_points=False)
     with torch.no_grad():
-        encoding.tables[0].copy_(torch.rand_like(encoding.tables[0]))
+        encoding.table.copy_(torch.rand_like(encoding.table))
     corner = torch.tensor([[0.5, -0.5, 0.0]])  # vertex (3, 1, 2) of 4 cells over [-1, 1]
-    assert torch.allclose(encoding(corner), encoding.tables[0][(3 * 5 + 1) * 5 + 2], atol=1e-6)
+    assert torch.allclose(encoding(corner), encoding.table[(3 * 5 + 1) * 5 + 2], atol=1e-6)
     step = torch.tensor([[1e-3, 0.0, 0.0]])
     left = (encoding(corner) - encoding(corner - step)) / 1e-3
     right = (encoding(corner + step) - encoding(corner)) / 1e-3
@@ -128,7 +128,8 @@ def test_hash_interpolates_its_corners_and_has_a_continuous_slope():
 
 def test_hash_tables_never_exceed_their_size_and_every_point_finds_a_row():
     encoding = Hash(levels=6, width=2, log2_table=8, coarsest=2, finest=200)
-    assert max(len(table) for table in encoding.tables) == 256
+    assert max(encoding.rows) == 256
+    assert len(encoding.table) == sum(encoding.rows)
     points = torch.rand(1000, 3) * 2.6 - 1.3  # jitter may leave the cube
     assert torch.isfinite(encoding(points)).all()
 

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 PRIMES = (1, 2_654_435_761, 805_459_861)
@@ -159,39 +160,74 @@ class Hash(Encoding):
                 f"got {levels}, {width}, {coarsest}, {finest}, {log2_table}"
             )
         growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
-        self.cells = [round(coarsest * growth**level) for level in range(levels)]
-        self.rows = [min((cells + 1) ** 3, 2**log2_table) for cells in self.cells]
-        self.include_points = include_points
+        cells = [round(coarsest * growth**level) for level in range(levels)]
+        self.rows = [min((n + 1) ** 3, 2**log2_table) for n in cells]
+        self.dense = sum((n + 1) ** 3 <= 2**log2_table for n in cells)  # the first levels, as cells grow
+        self.include_points, self.width = include_points, width
         self.features = levels * width + 3 * include_points
-        self.tables = nn.ParameterList(nn.Parameter(torch.empty(rows, width)) for rows in self.rows)
-        for table in self.tables:
-            nn.init.uniform_(table, -1e-4, 1e-4)
-        corners = torch.cartesian_prod(*[torch.arange(2)] * 3)
-        self.register_buffer("corners", corners, persistent=False)
+        self.table = nn.Parameter(torch.empty(sum(self.rows), width).uniform_(-1e-4, 1e-4))
+        first = torch.tensor([0, *self.rows]).cumsum(0)[:-1]
+        buffers = {
+            "cells": torch.tensor(cells),
+            "first": first,
+        }
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer, persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        unit = (points + 1) / 2
-        features = [points] if self.include_points else []
-        for cells, table in zip(self.cells, self.tables, strict=True):
-            features.append(self._interpolate(unit * cells, cells, table))
-        return torch.cat(features, dim=-1)
+        return self._encode(points)[0]
 
-    def _interpolate(self, position: Tensor, cells: int, table: Tensor) -> Tensor:
-        """Smoothly blends the features of the eight corners around `position` [..., 3], in cells."""
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        features, corners, (x, y, z), slope = self._encode(points)
+
+        def pullback(cotangent: Tensor) -> Tensor:
+            flat = cotangent.flatten(0, -2)
+            by_level = flat[:, 3 * self.include_points :].T.unflatten(0, (-1, self.width))
+            moved = (corners * by_level.transpose(0, 1)[:, None, None, None]).sum(0)  # [2, 2, 2, K, P]
+            along_z = (moved * z).sum(2)
+            along_xy = (moved * (x[:, None] * y)[:, :, None]).sum((0, 1))
+            parts = (along_z * y).sum(1), (along_z * x[:, None]).sum(0), along_xy
+            steps = torch.stack([part[1] - part[0] for part in parts])
+            by_point = (steps * slope).sum(1).T
+            by_point = by_point + flat[:, :3] if self.include_points else by_point
+            return by_point.unflatten(0, cotangent.shape[:-1])
+
+        return features, pullback
+
+    def _encode(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+        """Features and what they are made of, for P points in all, K levels and C features a level.
+
+        Points are the last axis while it is worked on: long rows are what a processor is fast at.
+
+        Returns:
+            features: [..., F].
+            corners: [C, 2, 2, 2, K, P] table entries of the low and high corners in x, y and z.
+            blends: for x, y and z, [2, K, P] weights of the low and the high corner.
+            slope: [3, K, P] derivative of the high corner's weight by the point.
+        """
+        position = (points.flatten(0, -2).T[:, None] + 1) / 2 * self.cells[:, None]
         low = position.detach().floor()
-        fraction = position - low
-        smooth = fraction * fraction * (3 - 2 * fraction)
-        corner = self.corners.to(position.dtype)
-        # weights [..., 8]: product over axes of t (corner bit 1) or 1 - t (corner bit 0)
-        weights = (corner * smooth[..., None, :] + (1 - corner) * (1 - smooth[..., None, :])).prod(-1)
-        index = self._rows_of(low.long()[..., None, :] + self.corners, cells, len(table))
-        return (weights[..., None] * table[index]).sum(-2)
+        t = position - low
+        smooth = t * t * (3 - 2 * t)
+        x, y, z = torch.stack([1 - smooth, smooth], dim=1)
+        weights = (x[:, None] * y)[:, :, None] * z
+        # an embedding, not an index: its backward is several times faster on a CPU
+        corners = F.embedding(self._rows_of(low.long()), self.table).movedim(-1, 0)
+        features = (weights * corners).sum((1, 2, 3))  # [C, K, P]
+        features = features.transpose(0, 1).flatten(0, 1).T.unflatten(0, points.shape[:-1])
+        features = torch.cat([points, features], dim=-1) if self.include_points else features
+        return features, corners, (x, y, z), 3 * t * (1 - t) * self.cells[:, None]
 
-    @staticmethod
-    def _rows_of(vertex: Tensor, cells: int, rows: int) -> Tensor:
-        """Table rows of grid vertices [..., 3]: dense where the grid fits, else the spatial hash."""
-        if (cells + 1) ** 3 <= rows:
-            x, y, z = vertex.clamp(0, cells).unbind(-1)
-            return (x * (cells + 1) + y) * (cells + 1) + z
-        x, y, z = (vertex[..., axis] * PRIMES[axis] for axis in range(3))
-        return (x ^ y ^ z) % rows
+    def _rows_of(self, low: Tensor) -> Tensor:
+        """Table rows [2, 2, 2, K, P] of the corners of cells with low corners [3, K, P].
+
+        A grid that fits its table is indexed directly, the others by the spatial hash. Each axis is worked
+        out for its two vertices before they are combined into eight.
+        """
+        pairs = torch.stack([low, low + 1], dim=1)  # [3, 2, K, P]
+        last = self.cells[: self.dense, None]
+        x, y, z = torch.minimum(pairs[:, :, : self.dense].clamp(min=0), last)  # jitter may leave the cube
+        fitting = ((x[:, None] * (last + 1) + y)[:, :, None] * (last + 1)) + z
+        x, y, z = (axis * prime for axis, prime in zip(pairs[:, :, self.dense :], PRIMES, strict=True))
+        hashed = ((x[:, None] ^ y)[:, :, None] ^ z) % max(self.rows)
+        return torch.cat([fitting, hashed], dim=-2) + self.first[:, None]
