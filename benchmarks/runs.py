@@ -28,9 +28,9 @@ def train(name: str, *overrides: str) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def row(name: str, metrics: dict) -> str:
-    """A Markdown line for the known shapes: CD, floor and excess times 10^3, failures, size, seconds."""
-    summary, training = metrics["known"]["summary"], metrics["training"]
+def row(name: str, metrics: dict, role: str = "known") -> str:
+    """A Markdown line for the shapes of a role: CD, floor and excess times 10^3, failures, size, seconds."""
+    summary, training = metrics[role]["summary"], metrics["training"]
     if summary["cd"]["mean"] is None:
         cells = ["no surface"] + [""] * 4
     else:

@@ -25,7 +25,7 @@ from hydra import compose, initialize_config_dir
 from torch import nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from sdfhub.data.datamodule import Augmentation, StepBatches
+from sdfhub.data.datamodule import Augmentation, Loading, StepBatches
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.run import build_autodecoder
@@ -120,7 +120,7 @@ class OurStep:
     def __init__(self, shapes: list[RandomShape], samples: int, surface: int, choice: list[str], bf16: bool):
         config = plain(compose("config", overrides=choice))
         self.model = build_autodecoder(config, rows=len(shapes), steps=1000)
-        self.batches = StepBatches(shapes, len(shapes), samples, surface, Augmentation(), 0)
+        self.batches = StepBatches(shapes, Loading(len(shapes), samples, surface, 1, 0, Augmentation(), 0))
         configured = self.model.configure_optimizers()
         self.optimizer, self.bf16, self.step = configured["optimizer"], bf16, 0
 
@@ -220,7 +220,7 @@ def report(args: argparse.Namespace, steps: dict[str, object], seconds: dict[str
     for name, taken in seconds.items():
         step, share = steps[name], ""
         if isinstance(step, OurStep):
-            operations = args.shapes * step.operations(args.samples, step.batches.surface_per_shape)
+            operations = args.shapes * step.operations(args.samples, step.batches.loading.surface_per_shape)
             limit = rate[torch.bfloat16 if step.bf16 else torch.float32]
             share = f"{operations / taken / limit:.2f}"
         print(f"| {name} | {rows / taken:,.0f} | {reference / taken:.2f} | {share} |")

@@ -211,6 +211,8 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
     assert states[0]["global_step"] == states[1]["global_step"]
     for name, value in states[0]["state_dict"].items():
         assert torch.equal(value, states[1]["state_dict"][name]), name
+    done = run(["train.py"], *common, f"ckpt_path={half}", "decoder.dropout=0.2", "seed=1", expect=2)
+    assert "decoder.dropout=0.1 (now 0.2), seed=0 (now 1)" in done.stderr
 
 
 COMBINATIONS = list(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.data.datamodule import Augmentation, EpochSteps, StepBatches, wrapping_slice
+from sdfhub.data.datamodule import Augmentation, EpochSteps, Loading, StepBatches, wrapping_slice
 from sdfhub.errors import SdfhubError
 from sdfhub.model.fitting import MapFit
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
@@ -36,7 +36,7 @@ class FakeShape:
 
 def batches(shapes=5, per_step=2, samples=64, surface=16, augmentation=None, seed=0) -> StepBatches:
     balls = [FakeShape(0.4 + 0.05 * index) for index in range(shapes)]
-    return StepBatches(balls, per_step, samples, surface, augmentation or Augmentation(), seed)
+    return StepBatches(balls, Loading(per_step, samples, surface, 1, 0, augmentation or Augmentation(), seed))
 
 
 def test_clamped_l1_counts_only_the_band():
@@ -187,7 +187,7 @@ def test_map_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone():
     codes = torch.nn.Parameter(torch.randn(4, 4) * 0.5)
     train_balls(decoder, codes)
     before = {name: value.clone() for name, value in decoder.state_dict().items()}
-    unseen = StepBatches([FakeShape(0.47), FakeShape(0.52)], 2, 256, 0, Augmentation(), seed=3)
+    unseen = StepBatches([FakeShape(0.47), FakeShape(0.52)], Loading(2, 256, 0, 1, 0, Augmentation(), seed=3))
 
     def draw(step):
         batch = unseen[step]

@@ -37,7 +37,7 @@ class Augmentation:
 
     def __post_init__(self):
         if self.copies < 0 or not 0 < self.smallest <= 1:
-            raise ValueError("augmentation: copies must not be negative and smallest in (0, 1]")
+            raise ValueError("copies must not be negative and smallest in (0, 1]")
 
     def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
         """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
@@ -48,31 +48,49 @@ class Augmentation:
         return np.float32([flip, 1, 1]) * scale, scale
 
 
+@dataclass(frozen=True)
+class Loading:
+    """How much of which shapes a training step sees.
+
+    Args:
+        shapes_per_step: B, >= 1.
+        samples_per_shape: N, half outside, half inside, >= 2.
+        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
+        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
+            from being shorter than their overhead.
+        workers: loader processes; 0 draws in the training process.
+        augmentation: extra shapes.
+        seed: of every draw.
+    """
+
+    shapes_per_step: int
+    samples_per_shape: int
+    surface_per_shape: int
+    passes_per_epoch: int
+    workers: int
+    augmentation: Augmentation
+    seed: int
+
+    def __post_init__(self):
+        least = {"shapes_per_step": 1, "samples_per_shape": 2, "surface_per_shape": 0}
+        least |= {"passes_per_epoch": 1, "workers": 0}
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+
+
 class StepBatches(Dataset):
     """Training batches by step number.
 
     Args:
         shapes: S prepared shapes; shape s has code row s, its copy c row s + c * S.
-        shapes_per_step: B; never more than there are rows.
-        samples_per_shape: N, half of them outside, half inside.
-        surface_per_shape: M oriented surface points; 0 without normals.
-        augmentation: extra shapes.
-        seed: of every draw.
+        loading: what a step draws; never more shapes a step than there are rows.
     """
 
-    def __init__(
-        self,
-        shapes: Sequence[StoredShape],
-        shapes_per_step: int,
-        samples_per_shape: int,
-        surface_per_shape: int,
-        augmentation: Augmentation,
-        seed: int,
-    ):
-        self.shapes, self.seed, self.augmentation = shapes, seed, augmentation
-        self.rows = len(shapes) * (1 + augmentation.copies)
-        self.shapes_per_step = min(shapes_per_step, self.rows)
-        self.samples_per_shape, self.surface_per_shape = samples_per_shape, surface_per_shape
+    def __init__(self, shapes: Sequence[StoredShape], loading: Loading):
+        self.shapes, self.loading = shapes, loading
+        self.rows = len(shapes) * (1 + loading.augmentation.copies)
+        self.shapes_per_step = min(loading.shapes_per_step, self.rows)
         self.steps_per_pass = self.rows // self.shapes_per_step
         self.rank, self.world = 0, 1
 
@@ -90,10 +108,14 @@ class StepBatches(Dataset):
 
     def __getitem__(self, step: int) -> Batch:
         # every pass shuffles anew; rows beyond the last whole step wait for another pass's order
-        order = np.random.default_rng((self.seed, 1, step // self.steps_per_pass)).permutation(self.rows)
+        order = np.random.default_rng((self.loading.seed, 1, step // self.steps_per_pass)).permutation(
+            self.rows
+        )
         start = step % self.steps_per_pass * self.shapes_per_step
         rows = order[start : start + self.shapes_per_step][self.rank :: self.world]
-        drawn = [self._draw(int(row), np.random.default_rng((self.seed, 2, step, row))) for row in rows]
+        drawn = [
+            self._draw(int(row), np.random.default_rng((self.loading.seed, 2, step, row))) for row in rows
+        ]
         samples, surface = (torch.from_numpy(np.stack(part)) for part in zip(*drawn, strict=True))
         return Batch(
             rows=torch.from_numpy(rows),
@@ -107,15 +129,15 @@ class StepBatches(Dataset):
         """Samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
         copy, index = divmod(row, len(self.shapes))
         shape = self.shapes[index]
-        axes, scale = self.augmentation.transform(copy, row, self.seed)
-        inside = self.samples_per_shape // 2
+        axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
+        inside = self.loading.samples_per_shape // 2
         samples = np.concatenate(
             [
-                wrapping_slice(shape.outside, self.samples_per_shape - inside, rng),
+                wrapping_slice(shape.outside, self.loading.samples_per_shape - inside, rng),
                 wrapping_slice(shape.inside, inside, rng),
             ]
         )
-        surface = wrapping_slice(shape.surface, self.surface_per_shape, rng)
+        surface = wrapping_slice(shape.surface, self.loading.surface_per_shape, rng)
         if copy:
             samples *= np.append(axes, scale)
             surface *= np.concatenate([axes, np.sign(axes)])
@@ -164,43 +186,20 @@ class SdfDataModule(L.LightningDataModule):
 
     Args:
         shapes: prepared training shapes, in the order of the code table.
-        shapes_per_step: B.
-        samples_per_shape: N, half outside, half inside.
-        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
-        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
-            from being shorter than their overhead.
-        workers: loader processes; 0 draws in the training process.
-        augmentation: extra shapes.
-        seed: of every draw.
+        loading: how much of them a step and an epoch see.
     """
 
-    def __init__(
-        self,
-        shapes: Sequence[StoredShape],
-        shapes_per_step: int,
-        samples_per_shape: int,
-        surface_per_shape: int,
-        passes_per_epoch: int,
-        workers: int,
-        augmentation: Augmentation,
-        seed: int,
-    ):
+    def __init__(self, shapes: Sequence[StoredShape], loading: Loading):
         super().__init__()
-        if min(shapes_per_step, passes_per_epoch) < 1 or samples_per_shape < 2:
-            raise ValueError(
-                "data: shapes_per_step and passes_per_epoch must be at least 1, samples_per_shape 2"
-            )
         if not shapes:
-            raise SdfhubError("data: no shape is left to train on; look at the rejections above")
-        if surface_per_shape and not all(len(shape.surface) for shape in shapes):
+            raise SdfhubError("data: every shape that was to be trained on was rejected, as listed above")
+        if loading.surface_per_shape and not all(len(shape.surface) for shape in shapes):
             raise SdfhubError(
                 "normals=on: this data source carries no surface normals "
                 "(DeepSDF's npz files have none); train with normals=off"
             )
-        self.batches = StepBatches(
-            shapes, shapes_per_step, samples_per_shape, surface_per_shape, augmentation, seed
-        )
-        self.passes_per_epoch, self.workers = passes_per_epoch, workers
+        self.batches = StepBatches(shapes, loading)
+        self.passes_per_epoch, self.workers = loading.passes_per_epoch, loading.workers
 
     @property
     def rows(self) -> int:

@@ -83,9 +83,12 @@ class Decoder(nn.Module):
     ):
         super().__init__()
         if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
-            raise ValueError("decoder: depth, width and code_size must be at least 1, dropout in [0, 1)")
+            raise ValueError(
+                "depth, width and code_size must be at least 1, dropout in [0, 1); "
+                f"got {depth}, {width}, {code_size}, {dropout}"
+            )
         if not set(inject_encoding) | set(inject_code) <= set(range(1, depth + 1)):
-            raise ValueError(f"decoder: inject_encoding and inject_code name layers 1 to {depth}")
+            raise ValueError(f"inject_encoding and inject_code name layers 1 to {depth}")
         self.encoding, self.code_size = encoding, code_size
         self.dropout, self.tanh = dropout, tanh
         self.activations = nn.ModuleList(activation(first=index == 0) for index in range(depth))
@@ -100,7 +103,7 @@ class Decoder(nn.Module):
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(
-                    f"decoder: width {width} leaves no room for {after} re-injected features; "
+                    f"width {width} leaves no room for {after} re-injected features; "
                     "widen it, encode with fewer features, or set shorten=false"
                 )
             self.layers.append(Layer(hidden, encoded, code, outputs))

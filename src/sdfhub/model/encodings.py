@@ -156,7 +156,7 @@ class Hash(Encoding):
         super().__init__()
         if min(levels, width, coarsest) < 1 or finest < coarsest or not 1 <= log2_table <= 30:
             raise ValueError(
-                "hash: needs levels, width, coarsest >= 1, finest >= coarsest, 1 <= log2_table <= 30; "
+                "needs levels, width, coarsest >= 1, finest >= coarsest, 1 <= log2_table <= 30; "
                 f"got {levels}, {width}, {coarsest}, {finest}, {log2_table}"
             )
         growth = (finest / coarsest) ** (1 / max(levels - 1, 1))

@@ -66,9 +66,9 @@ class SdfLoss:
 
     def __post_init__(self):
         if self.delta <= 0 or min(self.lambda_code, self.tau, self.warmup_epochs) < 0:
-            raise ValueError("loss: delta must be positive; lambda_code, tau, warmup_epochs not negative")
+            raise ValueError("delta must be positive; lambda_code, tau, warmup_epochs not negative")
         if not 0 <= self.tau_start < 1:
-            raise ValueError(f"loss: tau_start must be in [0, 1), got {self.tau_start}")
+            raise ValueError(f"tau_start must be in [0, 1), got {self.tau_start}")
 
     def wants_gradients(self, progress: float) -> bool:
         """Whether the normal term counts at this share of training."""

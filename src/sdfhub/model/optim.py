@@ -29,7 +29,7 @@ class StepDecay:
 
     def __post_init__(self):
         if not (0 < self.every <= 1 and 0 < self.factor <= 1):
-            raise ValueError("schedule: every and factor must be in (0, 1]")
+            raise ValueError("every and factor must be in (0, 1]")
 
     def __call__(self, progress: float) -> float:
         # 1e-9: a progress that rounds to just below a step's edge belongs after it
@@ -48,7 +48,7 @@ class Cosine:
 
     def __post_init__(self):
         if not 0 <= self.final <= 1:
-            raise ValueError("schedule: final must be in [0, 1]")
+            raise ValueError("final must be in [0, 1]")
 
     def __call__(self, progress: float) -> float:
         return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
@@ -74,9 +74,11 @@ class Adam:
 
     def __post_init__(self):
         if self.warmup_steps < 0:
-            raise ValueError("optim: warmup_steps must be 0 or more")
+            raise ValueError(f"warmup_steps must not be negative, got {self.warmup_steps}")
         if min(self.lr_decoder, self.lr_codes) <= 0:
-            raise ValueError("optim: lr_decoder and lr_codes must be positive")
+            raise ValueError(
+                f"lr_decoder and lr_codes must be positive, got {self.lr_decoder} and {self.lr_codes}"
+            )
 
     def configure(
         self, decoder: Iterable[nn.Parameter], codes: Iterable[nn.Parameter], steps: int

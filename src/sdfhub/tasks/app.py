@@ -19,6 +19,9 @@ from sdfhub.errors import SdfhubError
 
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
 
+TASK_CONFIGS = ("config.yaml", "evaluate.yaml")
+"""Configs whose top-level keys tasks read."""
+
 
 def configuration_folder() -> Path:
     """The folder of YAMLs: inside an installed package, beside `src/` in a checkout."""
@@ -55,8 +58,9 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
 
     def guarded(config: DictConfig) -> None:
         try:
+            refuse_strangers(config)
             task(config)
-        except (SdfhubError, OmegaConfBaseException) as error:
+        except (SdfhubError, OmegaConfBaseException, OSError) as error:
             if verbose:
                 raise
             failures.append(error)
@@ -67,7 +71,10 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints composition errors itself, in its own words
     try:
         app()
-    except (HydraException, OmegaConfBaseException) as error:
+    except BrokenPipeError:  # `--help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except (HydraException, OmegaConfBaseException, OSError) as error:
         if verbose:
             raise
         failures.append(error)
@@ -81,19 +88,64 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
         sys.exit(2)
 
 
+def refuse_strangers(config: DictConfig) -> None:
+    """Refuses top-level keys that nothing reads, such as `+sweep=...` written for `sweeps=...`.
+
+    Raises:
+        SdfhubError: names the key.
+    """
+    known = set(_groups()) | {key for name in TASK_CONFIGS for key in _yaml(configuration_folder() / name)}
+    for key in config:
+        if key not in known:
+            raise SdfhubError(_no_such_key(str(key)))
+
+
 def one_line(error: Exception) -> str:
     """What a user needs of an error: what is wrong and, for a wrong choice, the choices."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror.lower()}; choose another place or make room there"
     text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
-    text = text.split(" Config search path:")[0].split(" full_key:")[0]
+    text = text.split(" Config search path:")[0].split(" full_key:")[0].split(" See https://hydra.cc")[0]
     unknown = re.match(r"Could not override '([^']+)'", text)
+    missing = re.match(r"Missing mandatory value: (\S+)", text)
+    if missing:
+        return f"{missing.group(1)}=...: must be given"
     return _no_such_key(unknown.group(1)) if unknown else text
 
 
 def _no_such_key(key: str) -> str:
     group, _, below = key.partition(".")
-    groups = sorted(folder.name for folder in configuration_folder().iterdir() if folder.is_dir())
+    groups = _groups()
     if below and group in groups:
-        return f"there is no key {key!r}; the YAMLs in conf/{group} hold the keys of {group}"
+        keys = _keys_of(group)
+        near = get_close_matches(key, keys, n=1, cutoff=0.85)
+        hint = f"did you mean {near[0]!r}?" if near else f"{group} has {', '.join(keys)}"
+        return f"there is no key {key!r}; {hint}"
     near = get_close_matches(key, groups, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"the groups are {', '.join(groups)}"
     return f"there is no group or key {key!r}; {hint}"
+
+
+def _groups() -> list[str]:
+    return sorted(folder.name for folder in configuration_folder().iterdir() if folder.is_dir())
+
+
+def _keys_of(group: str) -> list[str]:
+    """Dotted keys of all choices of a group."""
+    paths = sorted((configuration_folder() / group).glob("*.yaml"))
+    nodes = [_yaml(path) for path in paths] + [_yaml(configuration_folder() / "config.yaml").get(group, {})]
+    found = dict.fromkeys(f"{group}.{key}" for node in nodes for key in _leaves(node))
+    return [key for key in found if not key.endswith(("_target_", "_partial_", "defaults"))]
+
+
+def _leaves(node: dict, prefix: str = "") -> list[str]:
+    pairs = [(f"{prefix}{key}", value) for key, value in node.items()]
+    return [
+        leaf
+        for key, value in pairs
+        for leaf in (_leaves(value, key + ".") if isinstance(value, dict) else [key])
+    ]
+
+
+def _yaml(path: Path) -> dict:
+    return OmegaConf.to_container(OmegaConf.load(path), resolve=False)

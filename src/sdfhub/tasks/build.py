@@ -75,9 +75,12 @@ def check(value: Any, hint: Any, key: str) -> Any:
     try:
         return adapter.validate_python(value)
     except ValidationError as error:
-        wrong = error.errors()[0]
-        place = ".".join([key, *map(str, wrong["loc"])])
-        raise SdfhubError(f"{place}={wrong['input']!r}: {wrong['msg'].lower()}") from error
+        wrong = error.errors()
+        # only what indexes the value belongs to its place; pydantic adds the branches of a union
+        inner = wrong[0]["loc"] if isinstance(value, Mapping | list) else ()
+        place = ".".join([key, *map(str, inner)])
+        wanted = " or ".join(dict.fromkeys(one["msg"].lower().removeprefix("input ") for one in wrong))
+        raise SdfhubError(f"{place}={wrong[0]['input']!r}: {wanted}") from error
 
 
 def _locate(path: Any, key: str, within: str) -> type:

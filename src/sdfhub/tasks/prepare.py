@@ -10,6 +10,7 @@ from sdfhub.data import store as stores
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import Store
+from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 
@@ -30,12 +31,18 @@ def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
         data: the plain `data` group.
         progress: show a bar.
     """
+    shapes = check(data["shapes"], int | None, "data.shapes")
+    held_out = check(data["held_out"], int, "data.held_out")
+    if shapes is not None and shapes < 1:
+        raise SdfhubError(f"data.shapes={shapes}: must be at least 1, or null for all")
+    if held_out < 0:
+        raise SdfhubError(f"data.held_out={held_out}: must not be negative")
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     roles = split(
         source.shapes(),
-        train=check(data["shapes"], int | None, "data.shapes"),
-        test=check(data["held_out"], int, "data.held_out"),
+        train=shapes,
+        test=held_out,
         seed=check(data["split_seed"], int, "data.split_seed"),
     )
     return prepare_split(source, roles, preparation, data, progress)
@@ -55,9 +62,17 @@ def prepare_split(
     )
     train = [store[shape.id] for shape in roles.train if shape.id in store]
     held_out = [store[shape.id] for shape in roles.test if shape.id in store]
-    print(f"data: {source.name}: {len(train)} shapes to train on, {len(held_out)} held out")
+    lost = len(roles.train) + len(roles.test) - len(train) - len(held_out)
+    print(
+        f"data: {source.name}: {_counted(len(train))} to train on, {len(held_out)} held out"
+        + (f" ({_counted(len(roles.train + roles.test))} asked for, {lost} rejected)" if lost else "")
+    )
     print(f"store: {store.folder}: {store.summary()}")
     return Prepared(train, held_out, store)
+
+
+def _counted(shapes: int) -> str:
+    return f"{shapes} shape" + "s" * (shapes != 1)
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ import yaml
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
+from sdfhub.model.codes import CodeTable
 from sdfhub.tasks.build import build
 
 
@@ -69,12 +70,20 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> Auto
     torch.manual_seed(config["seed"])
     return AutoDecoder(
         decoder=build(config["decoder"], "decoder", within="sdfhub.model"),
-        codes=build(config["codes"], "codes", within="sdfhub.model")(shapes=rows),
+        codes=_codes(config, rows),
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
         steps=steps,
         seed=config["seed"],
     )
+
+
+def _codes(config: dict[str, Any], rows: int) -> CodeTable:
+    make = build(config["codes"], "codes", within="sdfhub.model")
+    try:
+        return make(shapes=rows, size=config["decoder"]["code_size"])
+    except ValueError as error:
+        raise SdfhubError(f"codes: {error}") from error
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
@@ -91,8 +100,10 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
             f"{path}: there is no such checkpoint; a run keeps checkpoints/last.ckpt"
         ) from error
     except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
-        kind = type(error).__name__
-        raise SdfhubError(f"{path}: not a readable checkpoint of an auto-decoder ({kind})") from error
+        raise SdfhubError(
+            f"{path}: not a readable checkpoint of an auto-decoder; give one that training wrote, "
+            "such as RUN/checkpoints/last.ckpt"
+        ) from error
     return weights
 
 

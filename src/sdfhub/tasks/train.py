@@ -1,7 +1,6 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from torch import Tensor
 
-from sdfhub.data.datamodule import SdfDataModule
+from sdfhub.data.datamodule import Loading, SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
@@ -21,7 +20,19 @@ from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.prepare import prepare_data
-from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_weights
+from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
+
+FREE_TO_CHANGE = (
+    "ckpt_path",
+    "output_root",
+    "callbacks.",
+    "checkpoint.",
+    "evaluate.",
+    "trainer.",
+    "data.store",
+)
+FREE_TO_CHANGE += ("data.workers", "data.loader.workers", "data.source.root")
+"""Settings under which a run may be continued though it was started with others."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,7 @@ class Parts:
     """What a config describes, built and so checked before the first shape is prepared."""
 
     evaluation: Evaluation
-    make_loader: Callable[..., SdfDataModule]
+    loading: Loading
     trainer: Trainer
     record: TrainingRecord
     resume_from: Path | None
@@ -44,7 +55,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     """
     parts = build_parts(config, run)
     prepared = prepare_data(config["data"])
-    loader = parts.make_loader(shapes=prepared.train)
+    loader = SdfDataModule(prepared.train, parts.loading)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     if parts.weights:
         put_weights(model, parts.weights, parts.resume_from)
@@ -56,12 +67,23 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         raise KeyboardInterrupt
     if not trainer.is_global_zero:
         return {}
+    training = parts.record.summary(model)
+    if not training["loss"]:
+        print(f"nothing was left to train in {parts.resume_from}: raise trainer.max_epochs to go on")
     known = dict(enumerate(prepared.train))
-    return evaluate_model(model, known, prepared.held_out, parts.evaluation, run, parts.record.summary(model))
+    metrics = evaluate_model(model, known, prepared.held_out, parts.evaluation, run, training)
+    trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
+    return metrics
 
 
 def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
-    """Optimiser steps of a whole training, from the trainer's `max_epochs` and `max_steps`."""
+    """Optimiser steps of a whole training, from the trainer's `max_epochs` and `max_steps`.
+
+    Raises:
+        SdfhubError: `max_epochs` is no positive number; schedules need an end.
+    """
+    if check(trainer["max_epochs"], int | None, "trainer.max_epochs") is None or trainer["max_epochs"] < 1:
+        raise SdfhubError(f"trainer.max_epochs={trainer['max_epochs']}: must be at least 1")
     epochs = trainer["max_epochs"] * steps_per_epoch
     return epochs if trainer.get("max_steps", -1) < 0 else min(epochs, trainer["max_steps"])
 
@@ -78,17 +100,62 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
         key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
     }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    build_autodecoder(config, rows=1)
+    weights = read_weights(resume_from) if resume_from else None
+    model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
+    if weights:
+        refuse_other_settings(resume_from, config)
+        put_weights(model, weights, resume_from)  # before the first shape is prepared
+    training_steps(config["trainer"], 1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
-        make_loader=build(config["data"]["loader"], "data.loader"),
+        loading=build(config["data"]["loader"], "data.loader"),
         trainer=build_trainer(config["trainer"], run, callbacks),
         record=record,
         resume_from=resume_from,
-        weights=read_weights(resume_from) if resume_from else None,
+        weights=weights,
     )
+
+
+def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
+    """Refuses to continue a checkpoint under settings that its training did not have.
+
+    What may differ changes neither the model nor its data: where files lie, how a run is watched and judged,
+    and how long it lasts.
+
+    Raises:
+        SdfhubError: names every setting that differs.
+    """
+    folder = checkpoint.parent.parent
+    if not (folder / "config.yaml").is_file():
+        return
+    then, now = flat(read_run(folder)[0]), flat(config)
+    differing = [
+        f"{key}={then.get(key)} (now {now.get(key)})"
+        for key in sorted(then | now)
+        if then.get(key) != now.get(key) and not key.startswith(FREE_TO_CHANGE)
+    ]
+    if differing:
+        raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
+
+
+def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by dotted key; a list counts as one setting."""
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
+    """Mean and median CD by role, for TensorBoard's table of runs."""
+    return {
+        f"final/{role}_cd_{statistic}": metrics[role]["summary"]["cd"][statistic]
+        for role in ("known", "held_out")
+        for statistic in ("mean", "median")
+        if role in metrics and metrics[role]["summary"].get("cd", {}).get(statistic) is not None
+    }
 
 
 def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
@@ -98,13 +165,17 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     try:
         return make(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
     except (ValueError, TypeError, MisconfigurationException) as error:
-        raise SdfhubError(f"trainer: {error}; trainer=auto takes what this machine has") from error
+        hint = "; trainer=auto takes what this machine has" if "ccelerator" in str(error) else ""
+        raise SdfhubError(f"trainer: {error}{hint}") from error
 
 
 def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
+    warnings.filterwarnings(
+        "ignore", ".*The dirpath has changed.*"
+    )  # a continued run has a folder of its own
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
