@@ -92,7 +92,7 @@ class Store:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         reasons = Counter(entry["reason"] for entry in self.rejected.values())
         seconds = sum(shape.seconds for shape in self) / max(1, len(self))
-        lines = [f"{len(self)} shapes kept, {len(self.rejected)} rejected, {seconds:.2f} s a shape"]
+        lines = [f"{len(self)} shapes kept, {len(self.rejected)} rejected; preparing took {seconds:.2f} s a shape"]
         for reason, count in reasons.most_common():
             id, entry = next((id, e) for id, e in self.rejected.items() if e["reason"] == reason)
             lines.append(f"  rejected {count} x {reason}, such as {id} ({entry['detail']})")
@@ -201,7 +201,8 @@ def _fill(source, shapes, preparation, folder, workers, progress) -> dict:
         results = ((index, function(shape)) for index, shape in enumerate(left))
     else:
         results = map_in_processes(function, left, workers)
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=not progress)
+    quiet = None if progress else True  # None: no bar where nobody watches
+    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet)
     try:
         for index, record in bar:
             is_crash = isinstance(record, Crashed)
