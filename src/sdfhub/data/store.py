@@ -92,7 +92,8 @@ class Store:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         reasons = Counter(entry["reason"] for entry in self.rejected.values())
         seconds = sum(shape.seconds for shape in self) / max(1, len(self))
-        lines = [f"{len(self)} shapes kept, {len(self.rejected)} rejected; preparing took {seconds:.2f} s a shape"]
+        kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
+        lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
         for reason, count in reasons.most_common():
             id, entry = next((id, e) for id, e in self.rejected.items() if e["reason"] == reason)
             lines.append(f"  rejected {count} x {reason}, such as {id} ({entry['detail']})")
