@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.datamodule import Augmentation, StepBatches, wrapping_slice
+from sdfhub.data.datamodule import Augmentation, Loading, StepBatches, wrapping_slice
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
@@ -105,7 +105,8 @@ def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Ev
     fitted = []
     for start in range(0, len(shapes), evaluation.fit_together):
         group = list(shapes[start : start + evaluation.fit_together])
-        batches = StepBatches(group, len(group), evaluation.fit.samples, 0, Augmentation(), evaluation.seed)
+        loading = Loading(len(group), evaluation.fit.samples, 0, 1, 0, Augmentation(), evaluation.seed)
+        batches = StepBatches(group, loading)
         draw = partial(_in_order, batches)
         fitted.append(evaluation.fit(decoder, draw, len(group), seed=evaluation.seed))
     return torch.cat(fitted)
