@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sdfhub.data.procedural import generate
 from sdfhub.errors import SdfhubError
@@ -120,8 +121,6 @@ def test_meshes_are_written_in_their_sources_frame(trained):
 
 
 def test_tensorboard_has_every_curve_picture_and_mesh(trained):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(trained[0] / "tensorboard"))
     events.Reload()
     wanted = ["loss/sdf", "loss/code", "loss/normal", "loss/total", "lr/decoder", "lr/codes", "codes/norm"]
@@ -213,6 +212,39 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
         assert torch.equal(value, states[1]["state_dict"][name]), name
     done = run(["train.py"], *common, f"ckpt_path={half}", "decoder.dropout=0.2", "seed=1", expect=2)
     assert "decoder.dropout=0.1 (now 0.2), seed=0 (now 1)" in done.stderr
+
+
+def curve(folder: Path, tag: str) -> list[float]:
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    return [event.value for event in events.Scalars(tag)]
+
+
+def test_two_processes_train_like_one_with_the_same_batch(tmp_path):
+    """Gloo on the CPU; each process reads half of a batch's shapes, and codes are longer than max_norm."""
+    common = [
+        *TINY,
+        "data.shapes=4",
+        "data.held_out=0",
+        "data.loader.passes_per_epoch=10",
+        "codes.max_norm=0.9",
+        f"data.store={tmp_path / 'store'}",
+        "callbacks=none",
+        "evaluate.known=0",
+        "trainer.max_epochs=1",
+        "trainer.log_every_n_steps=1",
+    ]
+    run(["train.py"], *common, "trainer=cpu", f"output_root={tmp_path / 'one'}")
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    run(["train.py"], *common, *two, f"output_root={tmp_path / 'two'}")
+    folders = [only_run(tmp_path / name) for name in ("one", "two")]
+    for tag in ("loss/sdf", "loss/normal", "loss/code", "loss/total"):
+        one, both = (curve(folder, tag) for folder in folders)
+        assert len(one) == 10
+        np.testing.assert_allclose(one, both, rtol=1e-4)
+    states = [load_autodecoder(folder, read_run(folder)[0]).state_dict() for folder in folders]
+    for name, value in states[0].items():
+        assert torch.allclose(value, states[1][name], atol=1e-4), name
 
 
 COMBINATIONS = list(

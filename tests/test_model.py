@@ -253,10 +253,12 @@ def test_codes_start_with_expected_norm_one():
     assert abs(norms.mean() - 1) < 0.05
 
 
-def test_max_norm_bounds_the_codes_that_are_read():
+def test_max_norm_shortens_long_codes_and_leaves_short_ones():
     torch.manual_seed(0)
-    codes = CodeTable(20, 8, max_norm=0.5)
-    codes(torch.arange(10))
-    norms = codes.table.norm(dim=1)
-    assert norms[:10].max() <= 0.5 + 1e-6
-    assert norms[10:].max() > 0.5
+    codes = CodeTable(20, 8, max_norm=0.9)
+    before = codes.table.detach().clone()
+    read = codes(torch.arange(10))
+    norms = before.norm(dim=1, keepdim=True)
+    assert norms.min() < 0.9 < norms.max()
+    assert torch.allclose(codes.table, before * (0.9 / norms).clamp(max=1), atol=1e-5)
+    assert torch.equal(read, codes.table[:10])

@@ -98,8 +98,10 @@ class AutoDecoder(L.LightningModule):
             values[f"lr/{group['name']}"] = group["lr"]
         for index, activation in enumerate(self.decoder.activations):
             values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
-        self.log_dict({name: float(value) for name, value in values.items()})
+        self.log_dict(
+            {name: float(value) for name, value in values.items()}, sync_dist=self.trainer.world_size > 1
+        )
 
     def on_train_batch_end(self, outputs, batch: Batch, batch_idx: int) -> None:
         seconds = time.perf_counter() - self._step_started
-        self.log("speed/samples_per_second", batch.sdf.numel() / seconds)
+        self.log("speed/samples_per_second", batch.sdf.numel() * self.trainer.world_size / seconds)

@@ -14,7 +14,8 @@ class CodeTable(nn.Module):
     Args:
         shapes: S, number of rows.
         size: L, numbers in a code.
-        max_norm: longest norm a code may have when it is read, or None for no limit.
+        max_norm: longest norm a code may have, or None for no limit; longer ones are shortened when codes
+            are read.
     """
 
     def __init__(self, shapes: int, size: int, max_norm: float | None = None):
@@ -29,7 +30,6 @@ class CodeTable(nn.Module):
     def forward(self, rows: Tensor) -> Tensor:
         """Codes [B, L] of table rows [B]."""
         if self.max_norm is not None:
-            with torch.no_grad():
-                read = self.table[rows]
-                self.table[rows] = read * (self.max_norm / read.norm(dim=1, keepdim=True)).clamp(max=1)
+            with torch.no_grad():  # of all rows: processes that read different ones must keep equal tables
+                self.table.renorm_(2, 0, self.max_norm)
         return self.table[rows]
