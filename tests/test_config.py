@@ -124,7 +124,7 @@ MISTAKES = {
     "ckpt_path=nowhere.ckpt": ["nowhere.ckpt"],
     "data=folder": ["data/meshes"],
     "data=shapenet": ["data/shapenet"],
-    "data=deepsdf": ["data/deepsdf"],
+    "data=deepsdf": ["normals=on", "normals=off"],
     "decoder.width=0": ["decoder", "width"],
     "encoding.frequencies=0": ["frequencies"],
     "codes._target_=os.system": ["codes._target_", "os.system"],

@@ -195,7 +195,7 @@ def test_map_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone():
         return batch.points[order], batch.sdf[order]
 
     fit = MapFit(steps=100, lr=2e-2, samples=256, spread=0.01, lambda_code=1e-4, delta=0.1)
-    fitted = fit(decoder, draw, 2)
+    fitted = fit(decoder, draw, [0, 1])
     points, sdf = draw(1000)
     error = clamped_l1(decoder(points, fitted), sdf, 0.1)
     assert error < 0.3 * clamped_l1(decoder(points, torch.zeros(2, 4)), sdf, 0.1)
@@ -207,13 +207,13 @@ def test_map_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone():
 def test_shapes_fitted_together_get_the_codes_they_get_alone():
     decoder = small_decoder(width=16)
     one, two = FakeShape(0.45), FakeShape(0.6)
-    fit = MapFit(steps=20, lr=5e-3, samples=64, spread=0.0, lambda_code=1e-4, delta=0.1)
+    fit = MapFit(steps=20, lr=5e-3, samples=64, spread=0.01, lambda_code=1e-4, delta=0.1)
     data = [torch.from_numpy(np.concatenate([s.outside[:32], s.inside[:32]])) for s in (one, two)]
     together = torch.stack(data)
-    both = fit(decoder, lambda step: (together[..., :3], together[..., 3]), 2)
+    both = fit(decoder, lambda step: (together[..., :3], together[..., 3]), [3, 4])
     for index in range(2):
         alone_data = together[index : index + 1]
-        alone = fit(decoder, lambda step, d=alone_data: (d[..., :3], d[..., 3]), 1)
+        alone = fit(decoder, lambda step, d=alone_data: (d[..., :3], d[..., 3]), [3 + index])
         # the prior is a mean over all numbers of all codes, hence the looseness
         assert torch.allclose(both[index], alone[0], atol=1e-3)
 

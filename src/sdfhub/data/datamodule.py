@@ -130,18 +130,19 @@ class StepBatches(Dataset):
         copy, index = divmod(row, len(self.shapes))
         shape = self.shapes[index]
         axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
-        inside = self.loading.samples_per_shape // 2
-        samples = np.concatenate(
-            [
-                wrapping_slice(shape.outside, self.loading.samples_per_shape - inside, rng),
-                wrapping_slice(shape.inside, inside, rng),
-            ]
-        )
+        samples = signed_samples(shape, self.loading.samples_per_shape, rng)
         surface = wrapping_slice(shape.surface, self.loading.surface_per_shape, rng)
         if copy:
             samples *= np.append(axes, scale)
             surface *= np.concatenate([axes, np.sign(axes)])
         return samples, surface
+
+
+def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
+    inside = count // 2
+    sides = (shape.outside, count - inside), (shape.inside, inside)
+    return np.concatenate([wrapping_slice(rows, wanted, rng) for rows, wanted in sides])
 
 
 def wrapping_slice(array: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -193,11 +194,6 @@ class SdfDataModule(L.LightningDataModule):
         super().__init__()
         if not shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected, as listed above")
-        if loading.surface_per_shape and not all(len(shape.surface) for shape in shapes):
-            raise SdfhubError(
-                "normals=on: this data source carries no surface normals "
-                "(DeepSDF's npz files have none); train with normals=off"
-            )
         self.batches = StepBatches(shapes, loading)
         self.passes_per_epoch, self.workers = loading.passes_per_epoch, loading.workers
 

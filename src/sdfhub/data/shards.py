@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -145,11 +146,12 @@ class StoredShape:
         scale: normalised units per source unit.
         statistics: plain numbers about the preparation.
         seconds: what loading and preparing took.
+        up: the axis that points up in the source's frame, for pictures.
     """
 
-    def __init__(self, id: str, folder: Path, record: dict):
+    def __init__(self, id: str, folder: Path, record: dict, up: Literal["y", "z"] = "z"):
         self.id = id
-        self.folder = folder
+        self.folder, self.up = folder, up
         self.category: str = record["category"]
         self.fingerprint: str = record["fingerprint"]
         self.credits: dict[str, str] = record["credits"]

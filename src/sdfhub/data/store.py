@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 from tqdm import tqdm
 
@@ -43,16 +44,17 @@ class Store:
         folder: where `manifest.json` lies.
         manifest: its content.
         ids: the shapes wanted of it; rejected ones are left out of `ids` and listed in `rejected`.
+        up: the axis that points up in the source's frame, for pictures.
     """
 
-    def __init__(self, folder: Path, manifest: dict, ids: list[str]):
+    def __init__(self, folder: Path, manifest: dict, ids: list[str], up: Literal["y", "z"] = "z"):
         self.folder = folder
         records, rejected = manifest["shapes"], manifest["rejected"]
         missing = [id for id in ids if id not in records and id not in rejected]
         if missing:
             raise SdfhubError(f"{folder}: shape {missing[0]} has not been prepared; run `sdfhub prepare`")
         self.rejected: dict[str, dict] = {id: rejected[id] for id in ids if id in rejected}
-        self._shapes = {id: StoredShape(id, folder / id, records[id]) for id in ids if id in records}
+        self._shapes = {id: StoredShape(id, folder / id, records[id], up) for id in ids if id in records}
 
     @classmethod
     def open(cls, root: str | Path, ids: list[str] | None = None) -> "Store":
@@ -132,7 +134,7 @@ def prepare(
                 manifest = _fill(source, shapes, preparation, folder, workers, progress)
         except OSError as error:
             raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
-    store = Store(folder, manifest, [shape.id for shape in shapes])
+    store = Store(folder, manifest, [shape.id for shape in shapes], source.up)
     if shapes and not len(store):
         what = "; ".join(line.strip() for line in store.summary().splitlines())
         raise SdfhubError(f"none of the {len(shapes)} shapes of data={source.name} is usable: {what}")
@@ -145,7 +147,7 @@ def preparation_hash(preparation: Preparation) -> str:
     return hashlib.sha256(settings.encode()).hexdigest()[:12]
 
 
-def shape_seed(shape: Shape) -> int:
+def shape_seed(shape: Shape | StoredShape) -> int:
     """The seed of a shape's samples: 63 bits of a hash of its id and fingerprint."""
     digest = hashlib.sha256(f"{shape.id}\n{shape.fingerprint}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1

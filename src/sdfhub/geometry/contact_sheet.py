@@ -21,7 +21,7 @@ def contact_sheet(
     Args:
         rows: pictures [S, S, 3] uint8 of one size; None (no surface) gets a tile that says so.
         row_labels: one text per row; [] for none.
-        column_captions: one text per column, written below the header line; [] for none.
+        column_captions: one text per column, of one or two lines; [] for none.
         path: where the PNG goes; its folder is made.
 
     Returns:
@@ -31,7 +31,10 @@ def contact_sheet(
     columns = max((len(row) for row in rows), default=0)
     font = ImageFont.load_default(max(11, size // 14))
     left = int(max((font.getlength(label) for label in row_labels), default=0)) + 20 if row_labels else 6
-    top = size // 8 + 10 if column_captions else 6
+    line = font.size * 1.35
+    top = (
+        int(line * max(caption.count("\n") + 1 for caption in column_captions)) + 16 if column_captions else 6
+    )
     page = Image.new("RGB", (left + columns * size + 6, top + len(rows) * size + 6), "white")
     draw = ImageDraw.Draw(page)
     for i, row in enumerate(rows):
@@ -44,8 +47,9 @@ def contact_sheet(
     for i, label in enumerate(row_labels):
         draw.text((10, top + (i + 0.5) * size), label, fill=_INK, font=font, anchor="lm")
     for j, caption in enumerate(column_captions):
-        text = _shortened(caption, font, size - 8)
-        draw.text((left + (j + 0.5) * size, top / 2), text, fill=_INK, font=font, anchor="mm")
+        for k, text in enumerate(caption.split("\n")):
+            where = left + (j + 0.5) * size, 8 + (k + 0.5) * line
+            draw.text(where, _shortened(text, font, size - 8), fill=_INK, font=font, anchor="mm")
     return _write_png(page, Path(path))
 
 

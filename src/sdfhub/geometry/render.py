@@ -1,8 +1,10 @@
 """Meshes to pictures by ray casting, without a display.
 
-Frame: +z up, shapes within the unit ball, their front towards -y. Colours are linear RGB in [0, 1] until the
-last step, which maps them to sRGB bytes.
+Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +y up are turned first. Colours
+are linear RGB in [0, 1] until the last step, which maps them to sRGB bytes.
 """
+
+from typing import Literal
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -22,6 +24,7 @@ def render(
     faces: np.ndarray,
     size: int = 256,
     *,
+    up: Literal["y", "z"] = "z",
     azimuth: float = -55.0,
     elevation: float = 24.0,
     colour: tuple[float, float, float] = CLAY,
@@ -36,6 +39,7 @@ def render(
         vertices: [V, 3], within the unit ball.
         faces: [F, 3] rows of `vertices`; F = 0 gives the background.
         size: width and height in pixels.
+        up: the axis of the mesh that points up; with "y" its front looks along +z, as is usual there.
         azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
         elevation: height of the camera above the horizon in degrees.
         colour: linear RGB of the surface, each in [0, 1].
@@ -49,6 +53,8 @@ def render(
     faces = np.asarray(faces)
     if len(faces):
         vertices = np.asarray(vertices, dtype=np.float64)
+        if up == "y":
+            vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
         scene = EmbreeScene()
         TriangleMesh(scene, vertices[faces].astype(np.float32))
         origins, directions = _camera_rays(2 * size, azimuth, elevation)

@@ -90,17 +90,15 @@ class AutoDecoder(L.LightningModule):
         )
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
-        values = {f"loss/{name}": part.detach() for name, part in parts.items()} | {
-            "loss/total": loss.detach()
-        }
+        values = {f"loss/{name}": part.detach() for name, part in parts.items()}
         values["codes/norm"] = self.codes.table[batch.rows].detach().norm(dim=-1).mean()
         for group in self.optimizers().param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
         for index, activation in enumerate(self.decoder.activations):
             values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
-        self.log_dict(
-            {name: float(value) for name, value in values.items()}, sync_dist=self.trainer.world_size > 1
-        )
+        shared = self.trainer.world_size > 1  # processes then log the mean over their shares of the batch
+        self.log("loss/total", loss.detach(), prog_bar=True, sync_dist=shared)
+        self.log_dict({name: float(value) for name, value in values.items()}, sync_dist=shared)
 
     def on_train_batch_end(self, outputs, batch: Batch, batch_idx: int) -> None:
         seconds = time.perf_counter() - self._step_started

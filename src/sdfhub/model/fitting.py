@@ -1,7 +1,7 @@
 """Codes of shapes that the decoder has not seen: MAP estimation with the decoder frozen."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,30 +41,30 @@ class MapFit:
             raise ValueError("fit: steps and samples must be at least 1, lr and delta positive")
 
     def __call__(
-        self, decoder: Decoder, draw: Callable[[int], tuple[Tensor, Tensor]], shapes: int, seed: int = 0
+        self, decoder: Decoder, draw: Callable[[int], tuple[Tensor, Tensor]], seeds: Sequence[int]
     ) -> Tensor:
         """Codes [B, L] of B shapes, fitted side by side; each depends on its own shape alone.
 
         Args:
             decoder: stays as it is; its mode is restored.
             draw: step number -> points [B, N, 3] and sdf [B, N].
-            shapes: B.
-            seed: of the initial codes.
+            seeds: of the B initial codes, one each, so that a code does not depend on its neighbours.
         """
         training, frozen = decoder.training, [p for p in decoder.parameters() if p.requires_grad]
         decoder.eval()
         for parameter in frozen:
             parameter.requires_grad_(False)
         try:
-            return self._optimize(decoder, draw, shapes, seed)
+            return self._optimize(decoder, draw, seeds)
         finally:
             for parameter in frozen:
                 parameter.requires_grad_(True)
             decoder.train(training)
 
     @torch.enable_grad()
-    def _optimize(self, decoder: Decoder, draw, shapes: int, seed: int) -> Tensor:
-        start = torch.randn(shapes, decoder.code_size, generator=torch.Generator().manual_seed(seed))
+    def _optimize(self, decoder: Decoder, draw, seeds: Sequence[int]) -> Tensor:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        start = torch.stack([torch.randn(decoder.code_size, generator=each) for each in generators])
         device = next(decoder.parameters()).device
         codes = (start * self.spread).to(device).requires_grad_()
         optimizer = torch.optim.Adam([codes], lr=self.lr)
@@ -75,6 +75,6 @@ class MapFit:
             loss = clamped_l1(decoder(points, codes), sdf, self.delta)
             loss = loss + self.lambda_code * codes.square().mean()
             optimizer.zero_grad()
-            (loss * shapes).backward()  # means over shapes would shrink each one's gradient
+            (loss * len(seeds)).backward()  # means over shapes would shrink each one's gradient
             optimizer.step()
         return codes.detach()

@@ -7,6 +7,7 @@ import fast_simplification
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import TQDMProgressBar
 
 from sdfhub.data.shards import StoredShape
 from sdfhub.errors import SdfhubError
@@ -41,10 +42,11 @@ class TrainingRecord(L.Callback):
             self._first.append(loss)
 
     def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        self._seconds = time.perf_counter() - self._started
+        watching = sum(one.seconds for one in trainer.callbacks if isinstance(one, MeshShapes))
+        self._seconds = time.perf_counter() - self._started - watching
 
     def summary(self, model: AutoDecoder) -> dict:
-        """Plain numbers: seconds of this process, optimiser steps of the whole run, parameters, loss."""
+        """Plain numbers: seconds without `MeshShapes`, steps of the whole run, parameters, loss."""
         mean = {"start": np.mean(self._first), "end": np.mean(self._last)} if self._last else {}
         return {
             "seconds": self._seconds,
@@ -52,6 +54,13 @@ class TrainingRecord(L.Callback):
             "parameters": sum(parameter.numel() for parameter in model.decoder.parameters()),
             "loss": {key: float(value) for key, value in mean.items()},
         }
+
+
+class LossBar(TQDMProgressBar):
+    """A progress bar with the loss and without Lightning's version number, which is no number here."""
+
+    def get_metrics(self, trainer: L.Trainer, module: AutoDecoder) -> dict:
+        return {key: value for key, value in super().get_metrics(trainer, module).items() if key != "v_num"}
 
 
 class MeshShapes(L.Callback):
@@ -73,10 +82,14 @@ class MeshShapes(L.Callback):
             raise ValueError("every_n_epochs, shapes and points must be at least 1, resolution at least 2")
         self.every_n_epochs, self.shapes = every_n_epochs, shapes
         self.resolution, self.points = resolution, points
+        self.seconds = 0.0  # spent here; no part of the training's own time
+        self._shown: set[str] = set()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
         if trainer.is_global_zero and (trainer.current_epoch + 1) % self.every_n_epochs == 0:
+            start = time.perf_counter()
             self._show(trainer, module)
+            self.seconds += time.perf_counter() - start
 
     @torch.inference_mode()
     def _show(self, trainer: L.Trainer, module: AutoDecoder) -> None:
@@ -103,10 +116,14 @@ class MeshShapes(L.Callback):
         except SdfhubError:  # a field that is not finite: the loss will say so, with a hint
             vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
         truth = shape.mesh
-        self._add_mesh(writer, f"{shape.id}/truth", truth.vertices, truth.faces, 0)
+        if shape.id not in self._shown:
+            self._shown.add(shape.id)
+            self._add_mesh(writer, f"{shape.id}/truth", truth.vertices, truth.faces, 0)
         if len(faces):
             self._add_mesh(writer, f"{shape.id}/reconstruction", vertices, faces, step)
-            sides = [render(truth.vertices, truth.faces), render(vertices, faces)]
+            sides = [
+                render(*side, up=shape.up) for side in ((truth.vertices, truth.faces), (vertices, faces))
+            ]
             writer.add_image(
                 f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC"
             )

@@ -12,10 +12,11 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.datamodule import Augmentation, Loading, StepBatches, wrapping_slice
+from sdfhub.data.datamodule import signed_samples, wrapping_slice
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
+from sdfhub.data.store import shape_seed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import mesh_field
 from sdfhub.geometry.metrics import judge
@@ -90,13 +91,14 @@ def evaluate_model(
     known, unseen = list(train.items())[: evaluation.known], list(held_out)[: evaluation.held_out]
     codes = model.codes.table.detach()
     roles = [("known", shape, codes[row]) for row, shape in known]
+    print(f"judging {len(known)} known and {len(unseen)} held-out shapes", flush=True)
     if unseen:
         codes = fit_held_out(model.decoder, unseen, evaluation)
         roles += [("held_out", shape, code) for shape, code in zip(unseen, codes, strict=True)]
     if any(shape.mesh is None for _, shape, _ in roles):
         rows = [(role, shape, distance_errors(model.decoder, code, shape)) for role, shape, code in roles]
         return write_distances(rows, training, out)
-    bar = tqdm(roles, desc="judging", unit="shape", leave=False)
+    bar = tqdm(roles, desc="judging", unit="shape", leave=False, disable=None)
     return write_scores([_judge(*row, model.decoder, evaluation) for row in bar], evaluation, training, out)
 
 
@@ -105,18 +107,20 @@ def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Ev
     fitted = []
     for start in range(0, len(shapes), evaluation.fit_together):
         group = list(shapes[start : start + evaluation.fit_together])
-        loading = Loading(len(group), evaluation.fit.samples, 0, 1, 0, Augmentation(), evaluation.seed)
-        batches = StepBatches(group, loading)
-        draw = partial(_in_order, batches)
-        fitted.append(evaluation.fit(decoder, draw, len(group), seed=evaluation.seed))
+        seeds = [shape_seed(shape) ^ evaluation.seed for shape in group]
+        draw = partial(_drawn, group, seeds, evaluation.fit.samples)
+        fitted.append(evaluation.fit(decoder, draw, seeds))
     return torch.cat(fitted)
 
 
-def _in_order(batches: StepBatches, step: int) -> tuple[Tensor, Tensor]:
-    """A step's points [B, N, 3] and distances [B, N] with the shapes in their own order."""
-    batch = batches[step]
-    order = batch.rows.argsort()
-    return batch.points[order], batch.sdf[order]
+def _drawn(shapes: list[StoredShape], seeds: list[int], samples: int, step: int) -> tuple[Tensor, Tensor]:
+    """A step's points [B, N, 3] and distances [B, N]; a shape's draw depends on its own seed alone."""
+    rows = [
+        signed_samples(shape, samples, np.random.default_rng((seed, step)))
+        for shape, seed in zip(shapes, seeds, strict=True)
+    ]
+    drawn = torch.from_numpy(np.stack(rows))
+    return drawn[..., :3], drawn[..., 3]
 
 
 def _judge(role: str, shape: StoredShape, code: Tensor, decoder: Decoder, evaluation: Evaluation) -> Judged:

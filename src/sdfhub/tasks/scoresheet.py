@@ -66,8 +66,14 @@ def write_scores(
     _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
     print(table(judged))
     print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
-    print(f"metrics:       {out / 'metrics.json'}\nTensorBoard:   tensorboard --logdir {out}")
+    _print_places(out, trained=training is not None)
     return result
+
+
+def _print_places(out: Path, trained: bool) -> None:
+    print(f"metrics:       {out / 'metrics.json'}")
+    if trained:  # a later evaluation writes no events
+        print(f"TensorBoard:   tensorboard --logdir {out}")
 
 
 def table(judged: Sequence[Judged]) -> str:
@@ -125,10 +131,15 @@ def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
     shown = [
         row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]
     ]
-    truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces) for row in shown]
-    ours = [render(row.vertices, row.faces) if len(row.faces) else None for row in shown]
-    captions = [f"{row.shape.id} ({row.role.replace('_', ' ')})" for row in shown]
+    truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces, up=row.shape.up) for row in shown]
+    ours = [render(row.vertices, row.faces, up=row.shape.up) if len(row.faces) else None for row in shown]
+    captions = [f"{row.shape.id}\n{_title(row)}" for row in shown]
     contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
+
+
+def _title(row: Judged) -> str:
+    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f}"
+    return f"{row.role.replace('_', '-')}, {cd}"
 
 
 def write_distances(
@@ -156,5 +167,5 @@ def write_distances(
     print("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     for line in lines:
         print("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))
-    print(f"metrics:       {out / 'metrics.json'}\nTensorBoard:   tensorboard --logdir {out}")
+    _print_places(out, trained=training is not None)
     return result

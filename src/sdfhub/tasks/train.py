@@ -16,7 +16,7 @@ from sdfhub.data.datamodule import Loading, SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.callbacks import TrainingRecord
+from sdfhub.tasks.callbacks import LossBar, TrainingRecord
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.prepare import prepare_data
@@ -54,6 +54,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         What `metrics.json` holds; empty in processes of a distributed run that are not the first.
     """
     parts = build_parts(config, run)
+    if parts.loading.surface_per_shape:
+        refuse_missing_normals(config["data"])
     prepared = prepare_data(config["data"])
     loader = SdfDataModule(prepared.train, parts.loading)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
@@ -108,6 +110,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     training_steps(config["trainer"], 1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
+    if config["trainer"].get("enable_progress_bar", True):
+        callbacks.append(LossBar())
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
         loading=build(config["data"]["loader"], "data.loader"),
@@ -138,6 +142,17 @@ def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
     ]
     if differing:
         raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
+
+
+def refuse_missing_normals(data: dict[str, Any]) -> None:
+    """Refuses a source without surface normals, before hours go into preparing it.
+
+    Raises:
+        SdfhubError: the source's shapes carry none.
+    """
+    source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    if not source.has_normals:
+        raise SdfhubError(f"normals=on: the files of data={source.name} carry none; train with normals=off")
 
 
 def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:

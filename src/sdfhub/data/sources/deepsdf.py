@@ -41,6 +41,8 @@ class DeepSdfSource(Source):
         test_split: the same for held-out shapes. Where either is given, unlisted shapes are left out.
     """
 
+    has_normals = False
+
     def __init__(
         self,
         root: str,

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
+from typing import Literal
 
 from sdfhub.data.mesh import FORMATS, buffer_path, read_mesh
 from sdfhub.data.shards import file_sha256
@@ -23,17 +24,25 @@ class FolderSource(Source):
         train_split: file listing the training shapes by path, `{"train": [...], "test": [...]}` or another
             form of `split_file.with_roles`; None lets a seed decide.
         test_split: the same for held-out shapes. Where either is given, unlisted files are left out.
+        up: the axis that points up in the files; only pictures are turned by it.
     """
 
-    def __init__(self, root: str, train_split: str | None = None, test_split: str | None = None):
-        self.root = Path(root)
+    def __init__(
+        self,
+        root: str,
+        train_split: str | None = None,
+        test_split: str | None = None,
+        up: Literal["y", "z"] = "y",
+    ):
+        self.root, self.up = Path(root), up
         self.train_split, self.test_split = train_split, test_split
         self.name = name_of_root("folder", self.root)
         self._files: dict[str, Path] = {}
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
-            raise SdfhubError(f"data.source.root={self.root}: no such folder")
+            what = "a file, not a folder" if self.root.exists() else "no such folder"
+            raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your meshes")
         self._files = self._by_id()
         if not self._files:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")

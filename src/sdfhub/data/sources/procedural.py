@@ -16,6 +16,7 @@ class ProceduralSource(Source):
     """
 
     name = "procedural"
+    up = "z"
 
     def __init__(self, categories: Mapping, count: int = 1000):
         self.categories = sorted(plain_categories(categories))

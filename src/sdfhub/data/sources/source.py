@@ -48,9 +48,13 @@ class Source(ABC):
 
     Attributes:
         name: folder-safe; the store keeps one folder per name, so it tells two roots apart.
+        up: the axis that points up in the source's frame; only pictures are turned by it.
+        has_normals: whether its shapes come with surface normals.
     """
 
     name: str
+    up: Literal["y", "z"] = "y"
+    has_normals = True
 
     @abstractmethod
     def shapes(self) -> list[Shape]:
