@@ -152,6 +152,21 @@ def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shape
     assert metrics["known"]["shapes"][0]["id"] == first["known"]["shapes"][0]["id"]
 
 
+def test_a_held_out_score_does_not_depend_on_the_shapes_beside_it(trained, tmp_path):
+    folder, _ = trained
+    few = ["evaluate=fast", "evaluate.resolution=32", "evaluate.points=1000", "evaluate.known=0"]
+    few += ["evaluate.fit.steps=15", "evaluate.fit.samples=400", f"run={folder}"]
+    scores = []
+    for count in (1, 3):
+        config = composed(*few, f"held_out={count}", f"out={tmp_path / str(count)}", config_name="evaluate")
+        shapes = evaluate_run(config)["held_out"]["shapes"]
+        scores.append(
+            {shape["id"]: shape["sdf_error"] if "sdf_error" in shape else shape["cd"] for shape in shapes}
+        )
+    (one,) = scores[0]
+    assert scores[0][one] == pytest.approx(scores[1][one], rel=1e-3)
+
+
 def test_loading_runs_no_code_of_a_strangers_checkpoint(trained, tmp_path):
     folder, _ = trained
     config, _ = read_run(folder)

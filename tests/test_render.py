@@ -100,3 +100,12 @@ def test_a_contact_sheet_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no space"):
         contact_sheet([[None]], [], [], tmp_path / "s.png")
     assert os.listdir(tmp_path) == []
+
+
+def test_a_mesh_with_y_up_is_turned_upright():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+    high = np.asarray(ball.vertices)[:, [0, 1, 2]] + [0, 0.5, 0]
+    standing = np.column_stack([high[:, 0], -high[:, 2], high[:, 1]])
+    assert np.array_equal(render(high, ball.faces, 64, up="y"), render(standing, ball.faces, 64))
+    rows = np.flatnonzero((render(high, ball.faces, 64, up="y") < 250).any(axis=(1, 2)))
+    assert rows.max() < 40
