@@ -1,10 +1,11 @@
 """Preparation: how fast one core makes signed samples of a mesh, and how many signs are right on broken ones.
 
-Run: python benchmarks/preparation.py [FOLDER] [--samples 500000] [--limit 20]
+Run: python benchmarks/preparation.py [FOLDER | open] [--samples 500000] [--limit 20]
 
-Without a folder the meshes are procedural chairs, each also with half its faces turned, so that both paths
-are timed. The second table breaks closed shapes in known ways and compares the rival sign methods with the
-truth of the clean twin.
+`open` stands for the furniture of data=open (`make data` fetches it), evenly over its categories. Without a
+folder the meshes are procedural chairs, each also with half its faces turned, so that both paths are timed.
+The second table breaks closed shapes in known ways and compares the rival sign methods with the truth of the
+clean twin.
 """
 
 import argparse
@@ -28,8 +29,10 @@ from sdfhub.data import sampling  # noqa: E402
 from sdfhub.data.preparation import Preparation  # noqa: E402
 from sdfhub.data.procedural import generate  # noqa: E402
 from sdfhub.data.signs import SIGN_METHODS  # noqa: E402
+from sdfhub.data.sources import OpenSource  # noqa: E402
 from sdfhub.errors import RejectedMesh  # noqa: E402
 from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
+from tests.categories import CATEGORIES  # noqa: E402
 
 SUFFIXES = {".obj", ".ply", ".stl", ".off", ".glb"}
 STAGES = {"visible_surface": "rays", "nearest_points": "distance"}
@@ -63,6 +66,12 @@ def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Triangles]]:
             chair = generate("chairs", index)
             yield f"chair {index}", chair
             yield f"chair {index}, half turned", flipped(chair, np.random.default_rng(index))
+        return
+    if folder == Path("open"):
+        source = OpenSource({name: rule for name, rule in CATEGORIES.items() if name != "planes"})
+        shapes = source.shapes()
+        for shape in shapes[:: max(1, len(shapes) // limit)][:limit]:
+            yield shape.id, source.load(shape)
         return
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     for path in paths[:: max(1, len(paths) // limit)][:limit]:
@@ -121,7 +130,9 @@ def print_accuracy(samples: int = 20_000) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", nargs="?", type=Path, help="meshes; procedural chairs if left out")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, help="meshes, or `open`; procedural chairs if left out"
+    )
     parser.add_argument("--samples", type=int, default=500_000)
     parser.add_argument("--limit", type=int, default=20, help="at most this many meshes")
     args = parser.parse_args()
