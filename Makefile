@@ -32,10 +32,11 @@ lint: install ## check style
 data: install ## fetch and unpack the real meshes of data=open into data/open (no root needed)
 	$(BIN)/python -m sdfhub.data.fetch
 
-bench: install ## run the benchmarks
+bench: install ## time preparation, meshing and training steps on this machine
+	$(BIN)/python benchmarks/procedural.py
 	$(BIN)/python benchmarks/preparation.py
 	$(BIN)/python benchmarks/meshing.py
-	$(BIN)/python benchmarks/combinations.py
+	$(BIN)/python benchmarks/training.py
 
 clean: ## remove the environment; prepared data and runs stay
 	rm -rf $(VENV)

@@ -16,9 +16,10 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sdfhub.data.procedural import generate
+from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
-from sdfhub.tasks.evaluate import evaluate_run
+from sdfhub.tasks.evaluate import choose_shapes, evaluate_run
 from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
 from tests.test_config import composed
 
@@ -165,6 +166,18 @@ def test_a_held_out_score_does_not_depend_on_the_shapes_beside_it(trained, tmp_p
         )
     (one,) = scores[0]
     assert scores[0][one] == pytest.approx(scores[1][one], rel=1e-3)
+
+
+def test_trained_shapes_are_never_judged_as_unseen_ones_under_other_settings_of_their_source(trained):
+    folder, _ = trained
+    known = json.loads((folder / "split.json").read_text())["train"]
+    source = ProceduralSource({"chairs": {}}, count=int(max(known)[-4:]) + 1)
+    config = {"shapes": None, "held_out": None}
+    roles = choose_shapes(source, {"train": [], "held_out": []}, set(known), config)
+    assert not roles.train and not {shape.id for shape in roles.test} & set(known)
+    assert len(roles.test) == source.count - len(known)
+    with pytest.raises(SdfhubError, match="was trained on"):
+        choose_shapes(source, {"train": [], "held_out": []}, set(known), config | {"shapes": known})
 
 
 def test_loading_runs_no_code_of_a_strangers_checkpoint(trained, tmp_path):

@@ -128,6 +128,7 @@ class MeshShapes(L.Callback):
                 f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC"
             )
         grid = sdf_slice(lambda x: module.decoder(x[None], code[None])[0], axis=0, device=code.device)
+        grid = grid if shape.up == "z" else grid[:, ::-1].T  # rows run along the picture's right, z or -z
         writer.add_image(
             f"{shape.id}/slice_x0", slice_image(grid, module.loss.delta), step, dataformats="HWC"
         )

@@ -91,7 +91,6 @@ def evaluate_model(
     known, unseen = list(train.items())[: evaluation.known], list(held_out)[: evaluation.held_out]
     codes = model.codes.table.detach()
     roles = [("known", shape, codes[row]) for row, shape in known]
-    print(f"judging {len(known)} known and {len(unseen)} held-out shapes", flush=True)
     if unseen:
         codes = fit_held_out(model.decoder, unseen, evaluation)
         roles += [("held_out", shape, code) for shape, code in zip(unseen, codes, strict=True)]
@@ -171,8 +170,12 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     model = load_autodecoder(run, trained)
     data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    is_trained_on = data["source"] == trained["data"]["source"]
-    roles = choose_shapes(source, roles_then if is_trained_on else {"train": [], "held_out": []}, config)
+    then = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
+    # under other settings (categories, count) a source of the same name offers shapes of the same ids
+    seen = set(roles_then["train"]) if source.name == then.name else set()
+    is_same = data["source"] == trained["data"]["source"]
+    roles = choose_shapes(source, roles_then if is_same else {"train": [], "held_out": []}, seen, config)
+    print(f"shapes: {len(roles.train)} known, {len(roles.test)} held out", flush=True)
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     prepared = prepare_split(source, roles, preparation, data)
     known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
@@ -181,10 +184,16 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     )
 
 
-def choose_shapes(source: Source, trained: dict[str, list[str]], config: dict[str, Any]) -> Split:
+def choose_shapes(
+    source: Source, trained: dict[str, list[str]], seen: set[str], config: dict[str, Any]
+) -> Split:
     """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
 
-    A shape that was trained on is never judged as an unseen one.
+    Args:
+        source: offers them.
+        trained: ids by role in the run; none where another source or other settings of it are judged.
+        seen: ids that were trained on: never judged as unseen ones.
+        config: the task's.
 
     Raises:
         SdfhubError: a shape that the source does not have.
@@ -192,10 +201,14 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], config: dict[st
     offered = {shape.id: shape for shape in source.shapes()}
     ids = check(config["shapes"], list[str] | None, "shapes")
     count = check(config["held_out"], int | None, "held_out")
-    unseen = [id for id in offered if id not in set(trained["train"])]
+    unseen = [id for id in offered if id not in seen]
     known = trained["train"]
     if ids is not None:
         known, unseen = [id for id in ids if id in known], [id for id in ids if id not in known]
+        if trained_on := seen.intersection(unseen):
+            raise SdfhubError(
+                f"shapes: {min(trained_on)} was trained on; leave out data= to judge it as known"
+            )
     elif trained["train"] and count is None:
         unseen = trained["held_out"]
     elif count is not None:

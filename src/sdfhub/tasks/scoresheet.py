@@ -138,7 +138,7 @@ def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
 
 
 def _title(row: Judged) -> str:
-    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f}"
+    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f} x10^-3"
     return f"{row.role.replace('_', '-')}, {cd}"
 
 

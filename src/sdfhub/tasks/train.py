@@ -31,7 +31,7 @@ FREE_TO_CHANGE = (
     "trainer.",
     "data.store",
 )
-FREE_TO_CHANGE += ("data.workers", "data.loader.workers", "data.source.root")
+FREE_TO_CHANGE += ("data.workers", "data.loader.workers", "data.source.root", "data.source.up")
 """Settings under which a run may be continued though it was started with others."""
 
 
