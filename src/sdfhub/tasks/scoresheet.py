@@ -127,7 +127,7 @@ def _write_mesh(row: Judged, path: Path) -> None:
 
 
 def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
-    """Ground truth above reconstruction, known shapes first."""
+    """Ground truth above reconstruction, known shapes first; CD times 10^3, as in the table."""
     shown = [
         row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]
     ]
@@ -138,7 +138,7 @@ def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
 
 
 def _title(row: Judged) -> str:
-    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f} x10^-3"
+    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f}"
     return f"{row.role.replace('_', '-')}, {cd}"
 
 

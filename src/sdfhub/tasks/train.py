@@ -1,5 +1,6 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,12 +111,13 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     training_steps(config["trainer"], 1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
-    if config["trainer"].get("enable_progress_bar", True):
+    watched = config["trainer"].get("enable_progress_bar", True) and sys.stdout.isatty()
+    if watched:  # in a file a bar is ten thousand lines
         callbacks.append(LossBar())
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
         loading=build(config["data"]["loader"], "data.loader"),
-        trainer=build_trainer(config["trainer"], run, callbacks),
+        trainer=build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks),
         record=record,
         resume_from=resume_from,
         weights=weights,
