@@ -211,7 +211,6 @@ class Hash(Encoding):
         smooth = t * t * (3 - 2 * t)
         x, y, z = torch.stack([1 - smooth, smooth], dim=1)
         weights = (x[:, None] * y)[:, :, None] * z
-        # an embedding, not an index: its backward is several times faster on a CPU
         corners = F.embedding(self._rows_of(low.long()), self.table).movedim(-1, 0)
         features = (weights * corners).sum((1, 2, 3))  # [C, K, P]
         features = features.transpose(0, 1).flatten(0, 1).T.unflatten(0, points.shape[:-1])

@@ -103,7 +103,7 @@ def refuse_strangers(config: DictConfig) -> None:
 def one_line(error: Exception) -> str:
     """What a user needs of an error: what is wrong and, for a wrong choice, the choices."""
     if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror.lower()}; choose another place or make room there"
+        return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
     text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
     text = text.split(" Config search path:")[0].split(" full_key:")[0].split(" See https://hydra.cc")[0]
     unknown = re.match(r"Could not override '([^']+)'", text)
