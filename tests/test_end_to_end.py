@@ -131,6 +131,8 @@ def test_tensorboard_has_every_curve_picture_and_mesh(trained):
     tensors = events.Tags()["tensors"]
     assert any("truth" in tag for tag in tensors)
     assert any("reconstruction" in tag for tag in tensors)
+    assert "final/held_out_cd_median" in events.Tags()["scalars"]
+    assert any("_hparams_" in tag for tag in events.summary_metadata)
 
 
 def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(trained):
@@ -238,8 +240,9 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
     assert states[0]["global_step"] == states[1]["global_step"]
     for name, value in states[0]["state_dict"].items():
         assert torch.equal(value, states[1]["state_dict"][name]), name
-    done = run(["train.py"], *common, f"ckpt_path={half}", "decoder.dropout=0.2", "seed=1", expect=2)
-    assert "decoder.dropout=0.1 (now 0.2), seed=0 (now 1)" in done.stderr
+    others = ["decoder.dropout=0.2", "seed=1", "trainer.gradient_clip_val=1.0"]
+    done = run(["train.py"], *common, f"ckpt_path={half}", *others, expect=2)
+    assert "decoder.dropout=0.1 (now 0.2), seed=0 (now 1), trainer.gradient_clip_val=None" in done.stderr
 
 
 def curve(folder: Path, tag: str) -> list[float]:

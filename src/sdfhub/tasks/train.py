@@ -23,16 +23,10 @@ from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
 
-FREE_TO_CHANGE = (
-    "ckpt_path",
-    "output_root",
-    "callbacks.",
-    "checkpoint.",
-    "evaluate.",
-    "trainer.",
-    "data.store",
-)
+FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
 FREE_TO_CHANGE += ("data.workers", "data.loader.workers", "data.source.root", "data.source.up")
+FREE_TO_CHANGE += ("trainer.max_", "trainer.enable_", "trainer.log_every_n_steps")
+FREE_TO_CHANGE += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
 """Settings under which a run may be continued though it was started with others."""
 
 
@@ -190,9 +184,8 @@ def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
-    warnings.filterwarnings(
-        "ignore", ".*The dirpath has changed.*"
-    )  # a continued run has a folder of its own
+    # a continued run has a folder of its own
+    warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
