@@ -160,13 +160,14 @@ def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
-    """Mean and median CD by role, for TensorBoard's table of runs."""
-    return {
-        f"final/{role}_cd_{statistic}": metrics[role]["summary"]["cd"][statistic]
-        for role in ("known", "held_out")
-        for statistic in ("mean", "median")
-        if role in metrics and metrics[role]["summary"].get("cd", {}).get(statistic) is not None
-    }
+    """Mean and median CD and shapes without a surface by role, for TensorBoard's table of runs."""
+    scores = {}
+    for role in ("known", "held_out"):
+        summary = metrics.get(role, {}).get("summary", {})
+        values = {f"cd_{name}": summary.get("cd", {}).get(name) for name in ("mean", "median")}
+        values["failed"] = summary.get("failed")
+        scores |= {f"final/{role}_{name}": value for name, value in values.items() if value is not None}
+    return scores
 
 
 def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
