@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry import mesher
+from sdfhub.geometry import marching, mesher
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, sdf_slice
 from sdfhub.geometry.metrics import is_closed
 
@@ -118,7 +118,7 @@ def test_coarse_to_fine_equals_dense(name, resolution):
 
 
 def test_slabs_join_to_the_dense_mesh(monkeypatch):
-    monkeypatch.setattr(mesher, "_SLAB_NODES", 10 * 64**2)
+    monkeypatch.setattr(marching, "SLAB_NODES", 10 * 40**2)
     have = mesh_field(torus, 64)
     assert_same_mesh(have, mesh_dense(torus, 64))
     assert is_closed(*have)
@@ -127,9 +127,8 @@ def test_slabs_join_to_the_dense_mesh(monkeypatch):
 def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
     want = mesh_dense(torus, 96)
     index = (want[0][0] + 1) * 95 / 2
-    seen = np.zeros((48, 48, 48), bool)
-    seen[tuple((index // 2).astype(int))] = True
-    monkeypatch.setattr(mesher, "_active_blocks", lambda *_: seen)
+    seen = np.array([[0, *(index // 2).astype(int)]])
+    monkeypatch.setattr(mesher, "candidate_blocks", lambda *_: seen)
     assert_same_mesh(mesh_field(torus, 96), want)
 
 
@@ -176,10 +175,10 @@ def test_faces_look_outward_and_close(name):
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
 
 
-@pytest.mark.parametrize("coarse", [None, 32])
+@pytest.mark.parametrize("mesh", [mesh_dense, mesh_field])
 @pytest.mark.parametrize("shift", [5.0, -5.0])
-def test_no_zero_crossing_is_an_empty_mesh(coarse, shift):
-    vertices, faces = mesh_field(lambda p: sphere(p) + shift, 40, coarse=coarse)
+def test_no_zero_crossing_is_an_empty_mesh(mesh, shift):
+    vertices, faces = mesh(lambda p: sphere(p) + shift, 40)
     assert vertices.shape == (0, 3) and faces.shape == (0, 3)
     assert vertices.dtype == np.float64 and faces.dtype == np.int64
 
