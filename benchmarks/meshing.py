@@ -1,109 +1,209 @@
-"""Meshing: every node of the grid against coarse to fine.
+"""Meshing: every node of the grid against coarse to fine, on spaces trained here.
 
-Run: python benchmarks/meshing.py [--resolutions 128 256]
+    python benchmarks/meshing.py                 # 6 shapes a space: minutes
+    python benchmarks/meshing.py --whole         # 100 shapes a space: hours
 
-Prints for each field and resolution the evaluations and seconds of both ways (one core), and how many
-vertices of the dense mesh the coarse-to-fine mesh lacks. Fields: analytic distances, exact distances to
-procedural chairs, and a random network of 5 x 128 ReLU units.
+Trains a small space (5 x 64) of each procedural category once, and keeps it below outputs/benchmarks; beside
+them a ReLU space without encoding, one that has hardly begun to train, and one untrained: their rough
+fields are where a piece of surface is most easily missed. Prints two Markdown tables.
+
+Compared: each shape's mesh against its dense twin. Timed: seconds of one core (process time: what other
+processes take does not count), the dense mesh on the first shapes, ours on all, both in turns.
+Peak memory: a process that loads the space and meshes its first shape at 512^3.
 """
 
 import argparse
-import itertools
+import resource
+import subprocess
+import sys
 import time
+from pathlib import Path
 
-import igl
 import numpy as np
 import torch
+from runs import ROOT, train
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sdfhub.data.procedural import generate
-from sdfhub.geometry.mesher import mesh_dense, mesh_field
+from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields
+from sdfhub.model.autodecoder import AutoDecoder
+from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
 
 TOLERANCE = 1e-6
+SMALL = [
+    "scale=cpu_200",
+    "decoder.width=64",
+    "data.held_out=0",
+    "data.preparation.samples=50000",
+    "trainer.max_epochs=40",
+    "callbacks=none",
+    "evaluate.known=0",
+]
+ROUGH = 10  # shapes compared of a space that is no trained category
+CATEGORIES = ("chairs", "lamps", "planes", "sofas", "tables")
+SPACES = {name: [f"category={name}", "experiment=fft_siren"] for name in CATEGORIES} | {
+    "relu": ["category=chairs", "activation=relu", "encoding=none", "normals=off"],
+    "short": ["category=lamps", "experiment=fft_hosc", "trainer.max_epochs=3"],
+}
 
 
-class Counted:
-    """A field that counts the points it is asked for."""
+class Measured:
+    """A field that knows how many points it was asked for and how long it took."""
 
     def __init__(self, field):
-        self.field, self.count = field, 0
+        self.field, self.points, self.seconds = field, 0, 0.0
 
-    def __call__(self, points: torch.Tensor) -> torch.Tensor:
-        self.count += len(points)
-        return self.field(points)
-
-
-def sphere(points: torch.Tensor) -> torch.Tensor:
-    return points.norm(dim=-1) - 0.6
-
-
-def rods(points: torch.Tensor) -> torch.Tensor:
-    """Nine leaning rods of radius 0.01, thinner than two steps of a 128^3 grid: it sees them in pieces."""
-    x, y, z = points.T
-    x, y = x - 0.2 * z, y + 0.1 * z
-    across, along = (a - 0.3 * (a / 0.3).round().clamp(-1, 1) for a in (x, y))
-    return torch.maximum(torch.hypot(across, along) - 0.01, z.abs() - 0.7)
+    def __call__(self, points: torch.Tensor, *shapes: torch.Tensor) -> torch.Tensor:
+        start = time.process_time()
+        values = self.field(points, *shapes)
+        self.seconds += time.process_time() - start
+        self.points += values.numel()
+        return values
 
 
-def random_network(seed: int = 0) -> torch.nn.Module:
-    """5 x 128 ReLU units, untrained, shifted so that about half of the cube is inside."""
-    torch.manual_seed(seed)
-    widths = [3, *[128] * 5]
-    layers = [(torch.nn.Linear(a, b), torch.nn.ReLU()) for a, b in itertools.pairwise(widths)]
-    network = torch.nn.Sequential(*itertools.chain(*layers), torch.nn.Linear(128, 1), torch.nn.Flatten(0))
-    with torch.no_grad():
-        network[-2].bias -= network(torch.rand(4096, 3) * 2 - 1).median()
-    return network
+def space(name: str, shapes: int) -> AutoDecoder:
+    """The trained model of a space, trained first if it is not there yet; `untrained` needs no training."""
+    if name == "untrained":
+        config, _ = read_run(folder("chairs", shapes))
+        return shifted(build_autodecoder(config, shapes).eval())
+    if not (folder(name, shapes) / "metrics.json").exists():
+        train(folder(name, shapes).name, *SMALL, *SPACES[name], f"data.shapes={shapes}")
+    return load_autodecoder(folder(name, shapes), read_run(folder(name, shapes))[0])
 
 
-def chair(index: int):
-    """Exact distances to a procedural chair in the normalised frame."""
-    vertices, faces = generate("chairs", index)
-    vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    vertices /= 1.03 * np.linalg.norm(vertices, axis=1).max()
-    kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL  # exact: these meshes are closed and one shell
-
-    def field(points: torch.Tensor) -> torch.Tensor:
-        distance = igl.signed_distance(points.double().numpy(), vertices, faces, sign_type=kind)[0]
-        return torch.from_numpy(distance)
-
-    return field
+def folder(name: str, shapes: int) -> Path:
+    return ROOT / "outputs" / "benchmarks" / f"meshing_{name}_{shapes}"
 
 
-def timed(mesh, field, resolution: int):
-    counted, start = Counted(field), time.perf_counter()
-    vertices, _ = mesh(counted, resolution)
-    return vertices, counted.count, time.perf_counter() - start
+@torch.no_grad()
+def shifted(model: AutoDecoder) -> AutoDecoder:
+    """The model with a tenth of the cube inside its first shape: an untrained one may have no surface."""
+    head, points = model.decoder.layers[-1].linear, 2 * torch.rand(1, 4096, 3) - 1
+    head.bias -= model.decoder(points, model.codes.table[:1]).quantile(0.1)
+    return model
 
 
-def without_partner(points: np.ndarray, others: np.ndarray) -> int:
-    if not (len(points) and len(others)):
-        return len(points)
-    return np.count_nonzero(cKDTree(others).query(points)[0] > TOLERANCE)
+def field_of(model: AutoDecoder, shape: int):
+    code = model.codes.table.detach()[shape]
+    return Measured(lambda points: model.decoder(points[None], code[None])[0])
 
 
-def compare(name: str, field, resolution: int) -> None:
-    dense, all_nodes, dense_seconds = timed(mesh_dense, field, resolution)
-    sparse, nodes, seconds = timed(mesh_field, field, resolution)
-    missed, extra = without_partner(dense, sparse), without_partner(sparse, dense)
-    evaluations = f"{all_nodes / 1e6:>10.2f}{nodes / 1e6:>10.3f}"
-    clock = f"{dense_seconds:>10.2f}{seconds:>10.2f}"
-    print(f"{name:<12}{resolution:>4}{evaluations}{clock}{len(dense):>10}{missed:>8}{extra:>7}", flush=True)
+def timed(mesh, *arguments, **options):
+    start = time.process_time()
+    result = mesh(*arguments, **options)
+    return result, time.process_time() - start
+
+
+def compare(have, want) -> tuple[float, int, bool]:
+    """Largest distance between partners, pieces of `want` with vertices that lack one, the same mesh?"""
+    (vertices, _), (dense, faces) = have, want
+    if not (len(vertices) and len(dense)):
+        return 0.0, pieces(faces, np.ones(len(dense), bool)), len(vertices) == len(dense)
+    there, back = cKDTree(vertices).query(dense)[0], cKDTree(dense).query(vertices)[0]
+    found = np.concatenate([there[there <= TOLERANCE], back[back <= TOLERANCE]])
+    same = len(have[1]) == len(faces) and bool((back <= TOLERANCE).all())
+    return found.max(initial=0), pieces(faces, there > TOLERANCE), same
+
+
+def pieces(faces: np.ndarray, lacking: np.ndarray) -> int:
+    """How many connected pieces of a mesh have vertices without a partner."""
+    a, b = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(lacking),) * 2)
+    return len(np.unique(connected_components(graph)[1][lacking]))
+
+
+def compared(name: str, model: AutoDecoder, resolution: int, shapes: int) -> str:
+    """A line of the first table."""
+    rows = []
+    for shape in range(shapes):
+        field = field_of(model, shape)
+        want = mesh_dense(field, resolution)
+        field.points = 0
+        rows.append((*compare(mesh_field(field, resolution), want), resolution**3 / field.points))
+    apart, missed, same, fewer = map(np.array, zip(*rows, strict=True))
+    cells = f"{resolution}^3 | {shapes} | {sum(missed)} | {apart.max():.1e} | {same.sum()} of {shapes}"
+    return f"| {name} | {cells} | {fewer.min():.1f} | {np.median(fewer):.1f} |"
+
+
+def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes: int, peak: str) -> str:
+    """A line of the second table."""
+    dense_seconds, seconds, share, fewer = [], [], [], []
+    for shape in range(shapes):
+        if shape < dense:
+            dense_seconds.append(timed(mesh_dense, field_of(model, shape), resolution)[1])
+        field = field_of(model, shape)
+        seconds.append(timed(mesh_field, field, resolution)[1])
+        share.append(field.seconds / seconds[-1])
+        fewer.append(resolution**3 / field.points)
+    ratio = min(dense_seconds) / np.array(seconds)
+    cells = [f"{min(dense_seconds):.1f}", f"{np.median(seconds):.2f}", f"{ratio.min():.1f}"]
+    cells += [f"{np.median(ratio):.1f}", f"{min(fewer):.1f}", f"{np.median(fewer):.1f}"]
+    return f"| {name} | {shapes} | {' | '.join(cells)} | {np.median(share):.0%} | {peak} |"
+
+
+def together(model: AutoDecoder, resolution: int, shapes: int) -> str:
+    """Meshing shapes together against one after another, in turns: a line."""
+    codes, best = model.codes.table.detach(), [np.inf, np.inf]
+    for _ in range(3):
+        _, one = timed(lambda: [mesh_field(field_of(model, row), resolution) for row in range(shapes)])
+        fields = Measured(lambda points, rows: model.decoder(points, codes[rows]))
+        _, many = timed(lambda fields=fields: list(mesh_fields(fields, shapes, resolution)))
+        best = [min(best[0], one), min(best[1], many)]
+    return f"{shapes} shapes at {resolution}^3 together: {best[0] / best[1]:.2f} x as fast as one by one"
+
+
+def head(columns: str) -> str:
+    names = columns.split(", ")
+    return f"\n| {' | '.join(names)} |\n|{' --- |' * len(names)}"
+
+
+def peak_memory(name: str, shapes: int) -> None:
+    """Prints MiB resident after loading, and at most, while this process meshes at 512^3."""
+    model = space(name, shapes)
+    loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    mesh_field(field_of(model, 0), 512)
+    print(f"{loaded / 1024:.0f} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}")
+
+
+def peak_elsewhere(name: str, shapes: int) -> str:
+    command = [sys.executable, __file__, "--peak", name, "--shapes", str(shapes)]
+    loaded, peak = subprocess.check_output(command, text=True).split()[-2:]
+    return f"{peak} ({loaded})"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--resolutions", type=int, nargs="+", default=[128, 256])
-    parser.add_argument("--chairs", type=int, default=2, help="exact distances to so many procedural chairs")
+    parser.add_argument("--whole", action="store_true", help="100 shapes a space")
+    parser.add_argument("--shapes", type=int, help="a space, all compared and timed")
+    parser.add_argument("--compare", type=int, default=128, help="resolution of the comparison")
+    parser.add_argument("--dense", type=int, default=1, help="shapes whose dense mesh is timed, at 256^3")
+    parser.add_argument("--spaces", nargs="+", default=[*SPACES, "untrained"])
+    parser.add_argument("--only", choices=("compared", "measured"))
+    parser.add_argument("--peak", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    shapes = arguments.shapes or (100 if arguments.whole else 6)
     torch.set_num_threads(1)
-    fields = {"sphere": sphere, "rods": rods, "relu 5x128": random_network()}
-    fields |= {f"chair {i}": chair(i) for i in range(arguments.chairs)}
-    print("evaluations in millions; missed and extra: vertices without a partner within 1e-6")
-    print("field        res     dense    sparse   dense s  sparse s  vertices  missed  extra")
-    for resolution in arguments.resolutions:
-        for name, field in fields.items():
-            compare(name, field, resolution)
+    if arguments.peak:
+        return peak_memory(arguments.peak, shapes)
+    models = {name: space(name, shapes) for name in arguments.spaces}
+    if arguments.only != "measured":
+        print(
+            head(
+                "space, grid, shapes, pieces missed, vertices apart, same mesh, fewer evaluations min, median"
+            )
+        )
+        for name, model in models.items():
+            some = shapes if name in CATEGORIES else min(shapes, ROUGH)
+            print(compared(name, model, arguments.compare, some), flush=True)
+    if arguments.only != "compared":
+        timings = "shapes, dense s, ours s, ratio min, median, fewer evaluations min, median"
+        print(head(f"space, {timings}, time in the field, MiB at 512^3 (loaded)"))
+        for name in [name for name in CATEGORIES if name in models]:
+            peak = peak_elsewhere(name, shapes)
+            print(measured(name, models[name], 256, arguments.dense, shapes, peak), flush=True)
+        for resolution in (64, 256):
+            print(together(models[min(models)], resolution, 4))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry import marching, mesher
-from sdfhub.geometry.mesher import mesh_dense, mesh_field, sdf_slice
+from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
 from sdfhub.geometry.metrics import is_closed
 
 RADIUS = 0.6
@@ -49,6 +49,12 @@ def spheres_apart(points):
     return (points[:, None] - centres).norm(dim=-1).amin(dim=1) - 0.012
 
 
+def sheet(points):
+    """A leaning square, thinner than a step of the coarsest level by far."""
+    leaning = torch.stack([points[:, 0], points[:, 1] - 0.3 * points[:, 0], points[:, 2]], dim=1)
+    return box(leaning, (0.1, 0.05, 0.0), (0.6, 0.018, 0.6))
+
+
 def clamped_rods(points):
     return rods(points).clamp(-0.1, 0.1)
 
@@ -78,10 +84,11 @@ class Waves(torch.nn.Module):
 
 class Counted:
     def __init__(self, field):
-        self.field, self.count = field, 0
+        self.field, self.count, self.calls = field, 0, 0
 
     def __call__(self, points):
         self.count += len(points)
+        self.calls += 1
         return self.field(points)
 
 
@@ -90,6 +97,7 @@ FIELDS = {
     "torus": torus,
     "boxes": boxes,
     "rods": rods,
+    "sheet": sheet,
     "clamped_rods": clamped_rods,
     "flat_rods": flat_rods,
     "spheres_apart": spheres_apart,
@@ -115,6 +123,52 @@ def test_coarse_to_fine_equals_dense(name, resolution):
     want = mesh_dense(field, resolution)
     assert len(want[0])
     assert_same_mesh(mesh_field(field, resolution, coarse=16), want)
+
+
+FAMILY = [rods, lambda points: sphere(points) + 5, Waves(0), spheres_apart, torus]
+
+
+class Family:
+    """Shapes that need unequal numbers of points, one of them without a surface; notes its calls."""
+
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, points, shapes):
+        self.calls.append((points.shape[0] * points.shape[1], shapes.tolist()))
+        rows = [FAMILY[shape](own) for own, shape in zip(points, shapes.tolist(), strict=True)]
+        return torch.stack(rows)
+
+
+def test_shapes_meshed_together_are_those_meshed_alone():
+    together = list(mesh_fields(Family(), len(FAMILY), 64, batch=2**14))
+    assert len(together) == len(FAMILY) and not len(together[1][0])
+    for have, field in zip(together, FAMILY, strict=True):
+        vertices, faces = mesh_field(field, 64)
+        assert np.abs(have[0] - vertices).max(initial=0) < 1e-6
+        assert np.array_equal(have[1], faces)
+
+
+def test_shapes_together_share_their_calls():
+    family = Family()
+    list(mesh_fields(family, len(FAMILY), 64, batch=2**30))
+    assert set(family.calls[0][1]) == set(range(len(FAMILY)))
+    alone = []
+    for field in FAMILY:
+        counted = Counted(field)
+        mesh_field(counted, 64, batch=2**30)
+        alone.append(counted.calls)
+    assert len(family.calls) == max(alone)
+
+
+def test_memory_bounds_groups_and_calls(monkeypatch):
+    monkeypatch.setattr(mesher, "_NODES_TOGETHER", 2 * 40**3)
+    family = Family()
+    meshes = mesh_fields(family, len(FAMILY), 40, batch=3000)
+    next(meshes)
+    assert {shape for _, shapes in family.calls for shape in shapes} == {0, 1}
+    assert len(list(meshes)) == len(FAMILY) - 1
+    assert max(points for points, _ in family.calls) <= 3000
 
 
 def test_slabs_join_to_the_dense_mesh(monkeypatch):

@@ -62,10 +62,12 @@ class Grid:
         return ((shape * self.n + i) * self.n + j) * self.n + k
 
     def evaluate(self, keys: np.ndarray) -> np.ndarray:
-        """The fields [N] float32 at the nodes of keys [N], where those of a shape stand together."""
-        place, shapes = _tiled(keys // self.n**3)
-        tiles = np.zeros((len(shapes), TILE), np.int64)
-        tiles.reshape(-1)[place] = keys % self.n**3
+        """The fields [N] float32 at the nodes of keys [N]: a shape's together, shapes in order."""
+        nodes = self.n**3
+        first = np.searchsorted(keys, nodes * np.arange(len(self.shapes) + 1))
+        place, shapes = _tiled(np.diff(first))
+        tiles = np.zeros((len(shapes), TILE), np.int32)
+        tiles.reshape(-1)[place] = keys - np.repeat(nodes * np.arange(len(self.shapes)), np.diff(first))
         values = np.empty(tiles.shape, np.float32)
         together = max(1, self.batch // TILE)
         for start in range(0, len(tiles), together):
@@ -84,7 +86,9 @@ class Grid:
 
     def _points(self, keys: np.ndarray) -> torch.Tensor:
         keys = torch.from_numpy(keys).to(self.device)
-        return self.axis[torch.stack([keys // self.n**2, keys // self.n % self.n, keys % self.n], dim=-1)]
+        column = keys // self.n
+        i = column // self.n
+        return self.axis[torch.stack([i, column - i * self.n, keys - column * self.n], dim=-1)]
 
     @torch.no_grad()  # not inference_mode: what a field caches must stay usable in training
     def _call(self, points: torch.Tensor, shapes: np.ndarray) -> np.ndarray:
@@ -99,12 +103,8 @@ class Grid:
         return values
 
 
-def _tiled(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places [N] of items in a row of tiles, given the shape [N] of each, and the shape [T] of every tile."""
-    if not len(shapes):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    first = np.flatnonzero(np.diff(shapes, prepend=-1))
-    count = np.diff(first, append=len(shapes))
-    tiles = -(-count // TILE)
-    shift = TILE * (np.cumsum(tiles) - tiles) - first
-    return np.arange(len(shapes)) + np.repeat(shift, count), np.repeat(shapes[first], tiles)
+def _tiled(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places [N] in a row of tiles of `counts` [S] items of each shape, and the shape [T] of each tile."""
+    tiles = -(-counts // TILE)
+    shift = TILE * (np.cumsum(tiles) - tiles) - (np.cumsum(counts) - counts)
+    return np.arange(counts.sum()) + np.repeat(shift, counts), np.repeat(np.arange(len(counts)), tiles)

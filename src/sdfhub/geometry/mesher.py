@@ -27,9 +27,9 @@ def mesh_fields(
     shapes: int,
     resolution: int = 256,
     bound: float = 1.0,
-    coarse: int = 64,
+    coarse: int = 32,
     batch: int | None = None,
-    safety: float = 1.5,
+    safety: float = 1.25,
     device: torch.device | str | None = None,
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
@@ -70,9 +70,9 @@ def mesh_field(
     field: Field,
     resolution: int = 256,
     bound: float = 1.0,
-    coarse: int = 64,
+    coarse: int = 32,
     batch: int | None = None,
-    safety: float = 1.5,
+    safety: float = 1.25,
     device: torch.device | str | None = None,
 ) -> Mesh:
     """The zero level of one field, evaluated coarse to fine: `mesh_fields` of one shape.

@@ -112,7 +112,7 @@ class MeshShapes(L.Callback):
         writer, step = trainer.logger.experiment, trainer.global_step
         code = module.codes.table[row]
         try:
-            vertices, faces = reconstruct(module.decoder, code, self.resolution)
+            [(vertices, faces)] = reconstruct(module.decoder, code[None], self.resolution)
         except SdfhubError:  # a field that is not finite: the loss will say so, with a hint
             vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
         truth = shape.mesh

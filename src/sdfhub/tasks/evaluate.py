@@ -1,6 +1,6 @@
 """Task `evaluate`: a trained shape space is meshed and judged, known and held-out shapes apart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import shape_seed
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.mesher import mesh_field
+from sdfhub.geometry.mesher import Mesh, mesh_fields
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder
@@ -123,20 +123,27 @@ def _drawn(shapes: list[StoredShape], seeds: list[int], samples: int, step: int)
 
 
 def _judge(role: str, shape: StoredShape, code: Tensor, decoder: Decoder, evaluation: Evaluation) -> Judged:
-    vertices, faces = reconstruct(decoder, code, evaluation.resolution)
+    [(vertices, faces)] = reconstruct(decoder, code[None], evaluation.resolution)
     metrics = judge((vertices, faces), shape.mesh, points=evaluation.points, seed=evaluation.seed)
     return Judged(role, shape, metrics, vertices, faces)
 
 
-def reconstruct(decoder: Decoder, code: Tensor, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3] of the zero level of f(., z), normalised frame; empty without one.
+def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:
+    """The zero levels of f(., z) of S codes, meshed together, one after another; empty without one.
 
     Args:
         decoder: in evaluation mode.
-        code: [L].
+        codes: [S, L].
         resolution: points along an axis of the grid.
+
+    Yields:
+        vertices [V, 3], normalised frame, and faces [F, 3].
     """
-    return mesh_field(lambda x: decoder(x[None], code[None])[0], resolution=resolution, device=code.device)
+
+    def fields(points: Tensor, shapes: Tensor) -> Tensor:
+        return decoder(points, codes[shapes])
+
+    return mesh_fields(fields, len(codes), resolution, device=codes.device)
 
 
 @torch.inference_mode()
