@@ -43,15 +43,17 @@ def march_blocks(
         return march(np.ones((2, 2, 2), np.float32))
     low = 2 * blocks.min(axis=0)  # only the box of the blocks is looked at
     high = np.minimum(2 * blocks.max(axis=0) + 2, n - 1)
-    nodes = np.stack(np.unravel_index(nodes, (n, n, n)), axis=1).astype(np.int32) - low.astype(np.int32)
     across = high[1:] - low[1:] + 1
-    depth = max(2, SLAB_NODES // int(across.prod()) // 2 * 2)
+    area = int(across.prod())
+    depth = max(2, SLAB_NODES // area // 2 * 2)
+    i, j, k = (index - lowest for index, lowest in zip(np.unravel_index(nodes, (n,) * 3), low, strict=True))
+    places = (i * across[0] + j) * across[1] + k
     parts, count = [], 0
     for start in range(0, high[0] - low[0], depth):
         stop = min(start + depth, high[0] - low[0])
-        inside = (nodes[:, 0] >= start) & (nodes[:, 0] <= stop)
+        inside = (places >= start * area) & (places < (stop + 1) * area)
         volume = np.ones((stop - start + 1, *across), np.float32)
-        volume[tuple((nodes[inside] - [start, 0, 0]).T)] = values[inside]
+        volume.reshape(-1)[places[inside] - start * area] = values[inside]
         vertices, faces = march(volume, _mask(2 * blocks - low - [start, 0, 0], volume.shape))
         parts.append((vertices + np.float32([start, 0, 0]), faces + count))
         count += len(vertices)
