@@ -1,13 +1,14 @@
 """Meshing: every node of the grid against coarse to fine, on spaces trained here.
 
-    python benchmarks/meshing.py                 # 6 shapes a space: minutes
-    python benchmarks/meshing.py --whole         # 100 shapes a space: hours
+    python benchmarks/meshing.py                 # 4 shapes a space: minutes
+    python benchmarks/meshing.py --whole         # 100 shapes a space: most of an hour
 
 Trains a small space (5 x 64) of each procedural category once, and keeps it below outputs/benchmarks; beside
 them a ReLU space without encoding, one that has hardly begun to train, and one untrained: their rough
 fields are where a piece of surface is most easily missed. Prints two Markdown tables.
 
-Compared: each shape's mesh against its dense twin. Timed: seconds of one core (process time: what other
+Compared: each shape's mesh against its dense twin, at 96^3 (--compare), where the coarsest cells are larger
+than at 256^3 (24 an axis against 32). Timed: seconds of one core (process time: what other
 processes take does not count), the dense mesh on the first shapes, ours on all, both in turns.
 Peak memory: a process that loads the space and meshes its first shape at 512^3.
 """
@@ -65,6 +66,7 @@ class Measured:
 def space(name: str, shapes: int) -> AutoDecoder:
     """The trained model of a space, trained first if it is not there yet; `untrained` needs no training."""
     if name == "untrained":
+        space("chairs", shapes)  # for its settings
         config, _ = read_run(folder("chairs", shapes))
         return shifted(build_autodecoder(config, shapes).eval())
     if not (folder(name, shapes) / "metrics.json").exists():
@@ -145,7 +147,7 @@ def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes:
 def together(model: AutoDecoder, resolution: int, shapes: int) -> str:
     """Meshing shapes together against one after another, in turns: a line."""
     codes, best = model.codes.table.detach(), [np.inf, np.inf]
-    for _ in range(3):
+    for _ in range(2):
         _, one = timed(lambda: [mesh_field(field_of(model, row), resolution) for row in range(shapes)])
         fields = Measured(lambda points, rows: model.decoder(points, codes[rows]))
         _, many = timed(lambda fields=fields: list(mesh_fields(fields, shapes, resolution)))
@@ -176,13 +178,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--whole", action="store_true", help="100 shapes a space")
     parser.add_argument("--shapes", type=int, help="a space, all compared and timed")
-    parser.add_argument("--compare", type=int, default=128, help="resolution of the comparison")
+    parser.add_argument("--compare", type=int, default=96, help="resolution of the comparison")
     parser.add_argument("--dense", type=int, default=1, help="shapes whose dense mesh is timed, at 256^3")
     parser.add_argument("--spaces", nargs="+", default=[*SPACES, "untrained"])
     parser.add_argument("--only", choices=("compared", "measured"))
     parser.add_argument("--peak", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    shapes = arguments.shapes or (100 if arguments.whole else 6)
+    shapes = arguments.shapes or (100 if arguments.whole else 4)
     torch.set_num_threads(1)
     if arguments.peak:
         return peak_memory(arguments.peak, shapes)
