@@ -34,7 +34,7 @@ def normalize_mesh(
     vertices, center, scale = _normalized(vertices, faces, preparation.min_extent_ratio)
     vertices, faces = _merged(vertices, faces)
     faces = _with_area(vertices, faces, preparation.max_zero_area)
-    faces = faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+    faces = _without_repeats(faces, len(vertices))
     count = len(np.unique(face_components(faces, len(vertices))))
     if count > preparation.max_components:
         limit = preparation.max_components
@@ -68,7 +68,7 @@ def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 def _normalized(
     vertices: np.ndarray, faces: np.ndarray, min_extent_ratio: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    used = np.unique(faces)
+    used = _used(faces, len(vertices))
     corners = vertices[used]
     low, high = corners.min(axis=0), corners.max(axis=0)
     half = high / 2 - low / 2  # halves first: the sum of two large numbers may overflow
@@ -87,11 +87,27 @@ def _normalized(
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices that share a cell of width 1e-6 become the first of them; unused ones go."""
-    used, faces = np.unique(faces, return_inverse=True)
+    used = _used(faces, len(vertices))
     cells = np.floor((vertices[used] + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
     keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
     _, first, row = np.unique(keys, return_index=True, return_inverse=True)
-    return vertices[used][first], row[faces.reshape(-1, 3)].astype(np.int64)
+    merged = np.empty(len(vertices), np.int64)
+    merged[used] = row
+    return vertices[used][first], merged[faces]
+
+
+def _used(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """Rows of the vertices that have a face, ascending."""
+    is_used = np.zeros(vertex_count, bool)
+    is_used[faces.ravel()] = True
+    return np.flatnonzero(is_used)
+
+
+def _without_repeats(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """The first of the faces with the same three corners, in the order of these."""
+    low, middle, high = np.sort(faces, axis=1).T
+    pair = np.unique(low * vertex_count + middle, return_inverse=True)[1]  # numbers, faster than rows
+    return faces[np.unique(pair * vertex_count + high, return_index=True)[1]]
 
 
 def _with_area(vertices: np.ndarray, faces: np.ndarray, max_zero_area: float) -> np.ndarray:

@@ -57,12 +57,14 @@ def prepare_mesh(
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:
     """[N, 3] float64 points near the surface and in the cube, in Morton order, exact in float32."""
     near = round(preparation.samples * preparation.near_share)
-    points = rng.uniform(-1, 1, (preparation.samples, 3))
-    deviation = np.sqrt(preparation.variances)[np.arange(near) % len(preparation.variances)]
+    points = np.empty((preparation.samples, 3), np.float32)
+    deviation = np.sqrt(preparation.variances).astype(np.float32)
     points[:near] = _area_weighted(surface.vertices, surface.faces, near, rng)[0]
-    points[:near] += rng.normal(size=(near, 3)) * deviation[:, None]
-    points = points.astype(np.float32).astype(np.float64)  # the distance is that of the point as stored
-    return points[morton_order(points)]
+    jitter = rng.standard_normal((near, 3), np.float32)
+    jitter *= deviation[np.arange(near) % len(deviation), None]
+    points[:near] += jitter
+    points[near:] = rng.uniform(-1, 1, (preparation.samples - near, 3))
+    return points[morton_order(points)].astype(np.float64)  # the distance is that of the point as stored
 
 
 def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: np.random.Generator):
@@ -102,14 +104,16 @@ def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: 
 def _area_weighted(
     vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[count, 3] points spread evenly over the faces, and their faces' normals, unit length."""
+    """[count, 3] points spread evenly over the faces, face by face, and their faces' unit normals."""
     normals = face_normals(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
-    face = rng.choice(len(faces), count, p=area / area.sum())
+    face = np.repeat(np.arange(len(faces)), rng.multinomial(count, area / area.sum()))
     return points_on_faces(vertices[faces], face, rng), normals[face] / area[face, None]
 
 
 def _oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    return _area_weighted(surface.vertices, surface.solid(), count, rng)
+    points, normals = _area_weighted(surface.vertices, surface.solid(), count, rng)
+    order = rng.permutation(count)
+    return points[order], normals[order]

@@ -29,7 +29,7 @@ from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import ShapeSamples
 
-VERSION = 1
+VERSION = 2
 """Of the layout on disk and of how samples are made; stores of another version are not reused."""
 
 MANIFEST = "manifest.json"

@@ -21,11 +21,15 @@ os.environ.setdefault(
     "IGL_NUM_THREADS", "1"
 )  # read by libigl's first call: shapes run in parallel, not points
 
-RAYS = 500_000
-"""Rays for a whole mesh, shared out by area; every face gets a fair number on top."""
-CHUNK = 250_000
-FROM = 2.5
-"""Distance from which rays are cast at a surface point; the mesh lies within the unit ball."""
+FIRST, SECOND = 16, 48
+"""Rays at every face, and at those that the first ones leave open."""
+RAYS = 1_500_000
+"""Rays of a round above which a face gets fewer than that, down to half."""
+LARGE = 200_000
+"""Rays of a round on top, shared out by area."""
+SURE = 0.12
+"""Share of its rays that must reach a face, all on one side, to need no others (an open side has 0.5)."""
+CHUNK = 50_000
 BAD = 0.1
 """Share of sightings on its less seen side from which a face counts as bad."""
 STEP = 1e-3
@@ -33,7 +37,7 @@ STEP = 1e-3
 SOLID = 0.8
 """Winding number above which the space behind a face counts as solid."""
 TOUCH = 5e-6
-"""A ray that stops this close to its target has seen it (a coincident face or a neighbour got in first)."""
+"""Above a face by which a ray towards the eye starts, so that a coincident face does not stop it."""
 
 
 @dataclass(frozen=True)
@@ -80,48 +84,79 @@ def view_directions(count: int) -> np.ndarray:
 
 def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """[N, 3] a uniform point on each triangle named in `face`, [N] rows of `corners` [F, 3, 3]."""
-    root, along = np.sqrt(rng.random(len(face))), rng.random(len(face))
-    weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
-    return np.einsum("nij,ni->nj", corners[face], weights)
+    root = np.sqrt(rng.random(len(face), corners.dtype))
+    third = root * rng.random(len(face), corners.dtype)
+    corner = corners[face]
+    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
+    points += third[:, None] * (corner[:, 2] - corner[:, 0])
+    points += corner[:, 0]
+    return points
 
 
 def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
     """The share of each face's two sides that parallel views from all around see.
 
     Rays are aimed at points on the faces rather than spread over pictures: a small face is then judged by as
-    many rays as it needs, and none is missed for falling between pixels.
+    many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
+    large ones more often; a second looks again at those that the first leaves open.
     """
-    corners = mesh.vertices[mesh.faces]
-    normals = face_normals(mesh.vertices, mesh.faces)
-    area = np.linalg.norm(normals, axis=1)
-    normals = normals / area[:, None]
-    scene = EmbreeScene()
-    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-
-    count = len(mesh.faces)
-    fair = int(np.clip(4 * RAYS / count, 16, 64))
-    rays = fair + (area / area.sum() * RAYS).astype(np.int64)
-    directions = rng.permutation(view_directions(views))
-    start = rng.integers(views, size=count)
-    first = np.concatenate([[0], np.cumsum(rays)])
-    sums = np.zeros((3, count))  # front, back, cast
-    for low in range(0, first[-1], CHUNK):
-        ray = np.arange(low, min(low + CHUNK, first[-1]))
-        face = np.searchsorted(first, ray, side="right") - 1
-        direction = directions[(start[face] + ray - first[face]) % views]
-        seen = _sees(scene, points_on_faces(corners, face, rng), direction, face)
-        cosine = np.einsum("nj,nj->n", normals[face], direction)
-        for row, weight in enumerate(
-            (seen * np.maximum(cosine, 0), seen * np.maximum(-cosine, 0), abs(cosine))
-        ):
-            sums[row] += np.bincount(face, weight, count)
-    return Sightings(*(sums[:2] / np.maximum(sums[2], 1e-12)))
+    watch = _Watch(mesh, rng.permutation(view_directions(views)), rng)
+    large = (watch.area / watch.area.sum() * LARGE).astype(np.int64)
+    watch.look(np.arange(len(large)), large + _fair(len(large), FIRST))
+    again = np.flatnonzero(_is_open(*watch.sums))
+    if len(again):
+        watch.look(again, large[again] + _fair(len(again), SECOND))
+    return Sightings(*(watch.sums[:2] / np.maximum(watch.sums[2], 1e-12)))
 
 
-def _sees(scene: EmbreeScene, points: np.ndarray, direction: np.ndarray, face: np.ndarray) -> np.ndarray:
-    origins = (points + FROM * direction).astype(np.float32)
-    hit = scene.run(origins, (-direction).astype(np.float32), output=True)
-    return (hit["primID"] == face) | (np.abs(hit["tfar"] - FROM) < TOUCH)
+def _fair(faces: int, most: int) -> int:
+    return int(np.clip(RAYS // faces, most // 2, most))
+
+
+def _is_open(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarray:
+    """[F] whether too few sightings, or some of either side, leave undecided what a face is."""
+    return (front + back < SURE * cast) | (np.minimum(front, back) > 0)
+
+
+class _Watch:
+    """Rays from all around at the faces of one mesh, and the sums of what they have seen.
+
+    Args:
+        mesh: what is looked at.
+        directions: [D, 3] towards the eye; a face takes them one after the other.
+        rng: of the points on the faces and of each face's first direction.
+    """
+
+    def __init__(self, mesh: NormalizedMesh, directions: np.ndarray, rng: np.random.Generator):
+        self.directions, self.rng = directions.astype(np.float32), rng
+        self.corners = mesh.vertices.astype(np.float32)[mesh.faces]
+        normals = face_normals(mesh.vertices, mesh.faces)
+        self.area = np.linalg.norm(normals, axis=1)
+        self.normals = (normals / self.area[:, None]).astype(np.float32)
+        self.next = rng.integers(len(directions), size=len(mesh.faces))
+        self.sums = np.zeros((3, len(mesh.faces)))  # weighted by the cosine: front, back, cast
+        self.scene = EmbreeScene()
+        TriangleMesh(self.scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+
+    def look(self, faces: np.ndarray, rays: np.ndarray) -> None:
+        """Casts `rays` [S] rays, at least one, at each of `faces` [S]."""
+        ends = np.cumsum(rays)
+        bounds = np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK))
+        for some in np.split(np.arange(len(faces)), np.unique(bounds)):
+            if len(some):
+                self._look(faces[some], rays[some])
+        self.next[faces] += rays
+
+    def _look(self, faces: np.ndarray, rays: np.ndarray) -> None:
+        starts = np.cumsum(rays) - rays
+        turn = np.repeat(self.next[faces] - starts, rays) + np.arange(rays.sum())
+        direction = self.directions[turn % len(self.directions)]
+        origins = points_on_faces(self.corners, np.repeat(faces, rays), self.rng)
+        origins += np.float32(TOUCH) * direction
+        cosine = np.einsum("nj,nj->n", np.repeat(self.normals[faces], rays, axis=0), direction)
+        seen = np.where(self.scene.run(origins, direction, query="OCCLUDED") < 0, cosine, 0)
+        for row, weight in enumerate((np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine))):
+            self.sums[row, faces] += np.add.reduceat(weight, starts)
 
 
 def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.random.Generator) -> Surface:
