@@ -1,9 +1,14 @@
 """Preparation: how fast one core makes signed samples of a mesh, and how many signs are right on broken ones.
 
-Run: python benchmarks/preparation.py [FOLDER | open] [--samples 500000] [--limit 20]
+Run: python benchmarks/preparation.py [FOLDER | open] [--samples 500000] [--limit 8 | --all] [--workers]
 
 `open` stands for the furniture of data=open (`make data` fetches it), evenly over its categories. Without a
 folder the meshes are procedural chairs, each also with half its faces turned, so that both paths are timed.
+Time is that of the processor, from the mesh file's bytes to samples in memory; writing them is not in it.
+Beside the stages' shares stand the rates of the libraries alone on the same work: embree on the last rays of
+the mesh as they came and shuffled, libigl's distances on 50,000 of the samples in Morton order; and the share
+of these rates that preparation reaches, all its own work on rays and distances counted.
+`--workers` prepares the meshes by one and by two processes instead, and prints the ratio of the rounds.
 The second table breaks closed shapes in known ways and compares the rival sign methods with the truth of the
 clean twin.
 """
@@ -13,7 +18,7 @@ import os
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,16 +26,20 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):  # a rate per core needs one
     os.environ[name] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import igl  # noqa: E402
 import numpy as np  # noqa: E402
 import trimesh  # noqa: E402
+from embreex.rtcore_scene import EmbreeScene  # noqa: E402
 from manifold3d import Manifold, OpType  # noqa: E402
 
-from sdfhub.data import sampling  # noqa: E402
+from sdfhub.data import sampling, visibility  # noqa: E402
 from sdfhub.data.preparation import Preparation  # noqa: E402
 from sdfhub.data.procedural import generate  # noqa: E402
-from sdfhub.data.signs import SIGN_METHODS  # noqa: E402
+from sdfhub.data.signs import SIGN_METHODS, morton_order  # noqa: E402
 from sdfhub.data.sources import OpenSource  # noqa: E402
+from sdfhub.data.workers import map_in_processes  # noqa: E402
 from sdfhub.errors import RejectedMesh  # noqa: E402
+from sdfhub.shapes import ShapeSamples  # noqa: E402
 from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 from tests.categories import CATEGORIES  # noqa: E402
 
@@ -59,48 +68,149 @@ class Stopwatch:
         return run
 
 
-def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Triangles]]:
-    """Names and triangles of the meshes in a folder, or of procedural chairs, whole and half turned."""
+class CountedScene(EmbreeScene):
+    """Counts the rays of preparation and keeps the last of them."""
+
+    rays = 0
+    last: tuple = ()
+
+    def run(self, origins, directions, **options):
+        CountedScene.rays += len(origins)
+        CountedScene.last = self, origins, directions, options
+        return super().run(origins, directions, **options)
+
+
+visibility.EmbreeScene = CountedScene
+
+
+def rate(function: Callable, count: int, rounds: int = 3) -> float:
+    """The best of some rounds' items a processor second."""
+    seconds = []
+    for _ in range(rounds):
+        start = time.process_time()
+        function()
+        seconds.append(time.process_time() - start)
+    return count / max(min(seconds), 1e-9)
+
+
+def raw_rates(samples: ShapeSamples) -> tuple[float, float, float]:
+    """Rays a second of embree alone, in order and shuffled, and distances a second of libigl alone."""
+    in_order = shuffled = float("nan")
+    if CountedScene.last:
+        scene, origins, directions, options = CountedScene.last
+        order = np.random.default_rng(0).permutation(len(origins))
+        mixed = origins[order], directions[order]
+        in_order = rate(lambda: EmbreeScene.run(scene, origins, directions, **options), len(origins))
+        shuffled = rate(lambda: EmbreeScene.run(scene, *mixed, **options), len(origins))
+    points = samples.points[:50_000].astype(np.float64)
+    points, tree = points[morton_order(points)], igl.AABB()
+    tree.init(samples.mesh.vertices, samples.mesh.faces)
+    query = (samples.mesh.vertices, samples.mesh.faces, points)
+    return in_order, shuffled, rate(lambda: tree.squared_distance(*query), len(points))
+
+
+Loader = Callable[[], Triangles]
+
+
+def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
+    """Names and loaders of the meshes in a folder, or of procedural chairs whole and half turned."""
     if folder is None:
         for index in range(limit):
             chair = generate("chairs", index)
-            yield f"chair {index}", chair
-            yield f"chair {index}, half turned", flipped(chair, np.random.default_rng(index))
+            yield f"chair {index}", lambda chair=chair: chair
+            yield f"chair {index}, half turned", lambda c=chair, i=index: flipped(c, np.random.default_rng(i))
         return
     if folder == Path("open"):
         source = OpenSource({name: rule for name, rule in CATEGORIES.items() if name != "planes"})
         shapes = source.shapes()
         for shape in shapes[:: max(1, len(shapes) // limit)][:limit]:
-            yield shape.id, source.load(shape)
+            yield shape.id, lambda shape=shape: source.load(shape)
         return
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     for path in paths[:: max(1, len(paths) // limit)][:limit]:
-        mesh = trimesh.load_mesh(path, process=False)
-        yield path.stem, (np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        yield path.stem, lambda path=path: _loaded(path)
+
+
+def _loaded(path: Path) -> Triangles:
+    mesh = trimesh.load_mesh(path, process=False)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+COLUMNS = (
+    "mesh | faces | samples/s | load | rays | dist. | sign | rest | rays cast | M rays/s embree | shuffled |"
+    " of it | M dist./s libigl | of it"
+)
 
 
 def print_rates(folder: Path | None, limit: int, preparation: Preparation) -> None:
-    """Samples a second and core, the stages' shares of the time, and what was rejected."""
+    """Samples a second and core, the stages' shares of the time, the libraries' own rates, rejections."""
     watch, rates, rejected = Stopwatch(), [], Counter()
-    print(f"{'mesh':34} {'faces':>7} {'samples/s':>10} {'rays':>6} {'dist.':>6} {'sign':>6} {'rest':>6}")
-    for name, mesh in meshes(folder, limit):
+    print(f"| {COLUMNS} |\n|{' --- |' * len(COLUMNS.split('|'))}")
+    for name, load in meshes(folder, limit):
         watch.seconds.clear()
+        CountedScene.rays, CountedScene.last = 0, ()
         start = time.process_time()
+        mesh = load()
+        watch.seconds["load"] = time.process_time() - start
         try:
-            sampling.prepare_mesh(mesh, preparation)
+            samples = sampling.prepare_mesh(mesh, preparation)
         except RejectedMesh as error:
             rejected[error.reason] += 1
-            print(f"{name[:34]:34} {len(mesh[1]):7} rejected: {error}")
             continue
         total = time.process_time() - start
-        shares = [watch.seconds[stage] / total for stage in ("rays", "distance", "sign")]
         rates.append(preparation.samples / total)
-        row = " ".join(f"{share:6.0%}" for share in (*shares, 1 - sum(shares)))
-        print(f"{name[:34]:34} {len(mesh[1]):7} {rates[-1]:10,.0f} {row}", flush=True)
+        print(
+            f"| {name} | {len(mesh[1])} | {rates[-1]:,.0f} | {_row(watch.seconds, total, samples)} |",
+            flush=True,
+        )
     if rates:
         low, middle, high = np.min(rates), np.median(rates), np.max(rates)
+        slow = sum(rate < 80_000 for rate in rates)
         print(f"\nsamples a second and core: median {middle:,.0f}, min {low:,.0f}, max {high:,.0f}")
+        print(f"below 80,000: {slow} of {len(rates)}")
     print(f"prepared {len(rates)}, rejected {rejected.total()}: {dict(rejected)}\n")
+
+
+def _row(seconds: dict[str, float], total: float, samples: ShapeSamples) -> str:
+    shares = [seconds[stage] / total for stage in ("load", "rays", "distance", "sign")]
+    in_order, shuffled, distances = raw_rates(samples)
+    cells = [f"{share:.0%}" for share in (*shares, 1 - sum(shares))]
+    if CountedScene.rays:
+        cells += [f"{CountedScene.rays:,}", f"{in_order / 1e6:.1f}", f"{shuffled / 1e6:.1f}"]
+        cells += [f"{CountedScene.rays / seconds['rays'] / in_order:.0%}"]
+    else:  # a clean closed mesh needs none
+        cells += ["0", "", "", ""]
+    reached = len(samples.points) / seconds["distance"] / distances
+    return " | ".join([*cells, f"{distances / 1e6:.2f}", f"{reached:.0%}"])
+
+
+class Prepare:
+    """Prepares a procedural chair, or a shape of data=open; pickles into worker processes."""
+
+    def __init__(self, preparation: Preparation, source: OpenSource | None):
+        self.preparation, self.source = preparation, source
+
+    def __call__(self, shape) -> bool:
+        mesh = self.source.load(shape) if self.source else generate("chairs", shape)
+        try:
+            return bool(sampling.prepare_mesh(mesh, self.preparation))
+        except RejectedMesh:
+            return False
+
+
+def print_scaling(folder: Path | None, limit: int, preparation: Preparation, rounds: int = 3) -> None:
+    """Seconds for the same meshes by one and by two worker processes, their start included."""
+    source = OpenSource({n: r for n, r in CATEGORIES.items() if n != "planes"}) if folder else None
+    shapes = source.shapes() if source else list(range(limit))
+    shapes, prepare = shapes[:: max(1, len(shapes) // limit)][:limit], Prepare(preparation, source)
+    print(f"{len(shapes)} meshes\n\n| s with 1 process | s with 2 | ratio |\n| --- | --- | --- |")
+    for _ in range(rounds):
+        seconds = []
+        for workers in (1, 2):
+            start = time.perf_counter()
+            list(map_in_processes(prepare, shapes, workers))
+            seconds.append(time.perf_counter() - start)
+        print(f"| {seconds[0]:.1f} | {seconds[1]:.1f} | {seconds[0] / seconds[1]:.2f} |", flush=True)
 
 
 def clean_shapes() -> list[Triangles]:
@@ -134,9 +244,15 @@ def main() -> None:
         "folder", nargs="?", type=Path, help="meshes, or `open`; procedural chairs if left out"
     )
     parser.add_argument("--samples", type=int, default=500_000)
-    parser.add_argument("--limit", type=int, default=20, help="at most this many meshes")
+    parser.add_argument("--limit", type=int, default=8, help="at most this many meshes")
+    parser.add_argument("--all", action="store_true", help="every mesh")
+    parser.add_argument("--workers", action="store_true", help="one and two processes instead")
     args = parser.parse_args()
-    print_rates(args.folder, args.limit, Preparation(samples=args.samples))
+    limit = 10**9 if args.all else args.limit
+    if args.workers:
+        print_scaling(args.folder, limit, Preparation(samples=args.samples))
+        return
+    print_rates(args.folder, limit, Preparation(samples=args.samples))
     print_accuracy()
 
 

@@ -1,12 +1,21 @@
 import numpy as np
 import pytest
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from manifold3d import Manifold, OpType
 
-from sdfhub.data.normalize import normalize_mesh
+from sdfhub.data.normalize import face_normals, normalize_mesh
+from sdfhub.data.pieces import ROOM, cut_long
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.sampling import sample_points
 from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
-from sdfhub.data.visibility import closed_surface, visible_surface
+from sdfhub.data.visibility import (
+    closed_surface,
+    points_on_faces,
+    sightings,
+    view_directions,
+    visible_surface,
+)
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
 CHAIR = triangles(refined(Manifold.batch_boolean(chair_parts(), OpType.Add)))
@@ -77,3 +86,61 @@ def test_hidden_faces_go_and_flipped_ones_turn():
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("nj,nj->n", normals, corners.mean(axis=1)) > 0).all()
     assert not surface.two_sided.any()
+
+
+def test_cut_faces_are_the_same_surface_in_shorter_pieces():
+    vertices, faces = triangles(Manifold.batch_boolean(chair_parts(), OpType.Add))
+    points, rows, source = cut_long(vertices, faces, 0.2)
+    corners, given = points[rows], vertices[faces]
+    assert np.linalg.norm(np.roll(corners, 1, axis=1) - corners, axis=2).max() <= 0.2
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    whole = np.cross(given[:, 1] - given[:, 0], given[:, 2] - given[:, 0])
+    total = np.stack([np.bincount(source, axis) for axis in normals.T], axis=1)
+    np.testing.assert_allclose(total, whole, atol=1e-12)  # areas and sides of the pieces add up
+    direction = whole / np.linalg.norm(whole, axis=1)[:, None]
+    offset = np.einsum("nij,nj->ni", corners - given[source, :1], direction[source])
+    np.testing.assert_allclose(offset, 0, atol=1e-12)
+
+
+def test_cutting_stops_before_it_fills_memory():
+    corners = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
+    faces = np.random.default_rng(1).integers(0, 1000, (40_000, 3))
+    assert len(cut_long(corners, faces, 0.01)[1]) <= len(faces) + ROOM
+
+
+def test_distances_to_cut_faces_equal_those_to_whole_ones():
+    import igl
+
+    mesh = triangles(Manifold.batch_boolean(chair_parts(), OpType.Add))
+    surface, points = surface_and_points(mesh)
+    nearest, tree = nearest_points(points, surface), igl.AABB()
+    tree.init(surface.vertices, surface.faces)
+    squared = tree.squared_distance(surface.vertices, surface.faces, points)[0]
+    np.testing.assert_allclose(nearest.distance, np.sqrt(squared), atol=1e-14)
+    corners = surface.vertices[surface.faces[nearest.face]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(np.einsum("nj,nj->n", nearest.foot - corners[:, 0], normals), 0, atol=1e-12)
+
+
+def test_rays_from_the_faces_see_what_rays_at_the_faces_see():
+    mesh = normalize_mesh(*punctured(CHAIR, np.random.default_rng(0)))
+    seen, rng = sightings(mesh, 100, np.random.default_rng(0)), np.random.default_rng(1)
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    directions, normals = view_directions(400), face_normals(mesh.vertices, mesh.faces)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    sums = np.zeros((2, len(mesh.faces)))
+    face = np.arange(len(mesh.faces))
+    for direction in directions:
+        origins = points_on_faces(mesh.vertices[mesh.faces], face, rng) + 2.5 * direction
+        towards = np.broadcast_to(-direction, origins.shape)
+        hit = scene.run(origins.astype(np.float32), towards.astype(np.float32), output=True)
+        cosine = normals @ direction * (hit["primID"] == face)
+        sums += np.maximum([cosine, -cosine], 0)
+    plain = sums / np.abs(normals @ directions.T).sum(axis=1)
+    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
+    for few, many in zip((seen.front, seen.back), plain, strict=True):
+        assert np.average(few - many, weights=area) == pytest.approx(0, abs=0.01)
+        assert np.average(np.abs(few - many), weights=area) < 0.08
+    is_kept, is_kept_plain = seen.front + seen.back > 0.04, plain.sum(axis=0) > 0.04
+    assert np.average(is_kept != is_kept_plain, weights=area) < 0.01

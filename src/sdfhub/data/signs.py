@@ -24,7 +24,7 @@ INNER = 0.95
 CLEAR = 0.1
 """Distance of a winding number from a whole one below which it may speak for others."""
 ROUGH, CLOSE = 1.0, 2.0
-"""Distances, in radii, from which libigl sums up faces: errors of up to 0.6 (1 in 1000 above 0.3) and 0.01."""
+"""Distances, in radii, from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3) and to 0.01."""
 NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
 """Edges above which faces are cut before a tree is built over them."""
 
