@@ -55,11 +55,8 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print("| faces | kept | s of processor | samples/s | peak GB | before preparing GB |")
     print("| --- | --- | --- | --- | --- | --- |")
-    kept = len(samples.mesh.faces)
-    rate = args.samples / seconds
-    print(
-        f"| {len(faces):,} | {kept:,} | {seconds:.0f} | {rate:,.0f} | {peak / 2**20:.2f} | {memory / 2**20:.2f} |"
-    )
+    cells = f"{len(faces):,} | {len(samples.mesh.faces):,} | {seconds:.0f} | {args.samples / seconds:,.0f}"
+    print(f"| {cells} | {peak / 2**20:.2f} | {memory / 2**20:.2f} |")
 
 
 if __name__ == "__main__":
