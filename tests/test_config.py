@@ -83,7 +83,7 @@ def test_paper_scale_has_a_third_of_deepsdfs_parameters(experiment):
     assert abs(parameters(decoder) / 585_073 - 1) < 1e-3
 
 
-def test_evaluation_recipe_is_the_papers():
+def test_evaluation_recipe_at_the_papers_scale_is_the_papers():
     evaluation = build(composed("scale=paper")["evaluate"], "evaluate")
     assert evaluation.points == 30_000
     assert (evaluation.fit.steps, evaluation.fit.lr, evaluation.fit.samples) == (800, 5e-3, 8000)

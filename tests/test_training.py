@@ -1,7 +1,6 @@
-"""Losses, schedules, batches and fitting: the equations and the order of the draws."""
+"""Losses, schedules and batches: the equations and the order of the draws."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -9,11 +8,9 @@ import torch
 
 from sdfhub.data.datamodule import Augmentation, EpochSteps, Loading, StepBatches, wrapping_slice
 from sdfhub.errors import SdfhubError
-from sdfhub.model.fitting import MapFit
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
 from sdfhub.model.optim import Adam, Cosine, StepDecay
 from sdfhub.shapes import Batch
-from tests.test_model import small_decoder
 
 LOSS = SdfLoss(delta=0.1, lambda_code=1e-4, code_norm="squared", warmup_epochs=100, tau=0.01)
 
@@ -169,56 +166,3 @@ def test_a_wrong_batch_is_refused_at_its_seam():
         Batch(rows, points, torch.zeros(2, 5), none, none)
     with pytest.raises(ValueError, match="rows"):
         Batch(rows.float(), points, torch.zeros(2, 4), none, none)
-
-
-def train_balls(decoder, codes, steps: int = 250) -> None:
-    stream = batches(shapes=4, per_step=4, samples=256, surface=0)
-    optimizer = torch.optim.Adam([*decoder.parameters(), codes], lr=5e-3)
-    for step in range(steps):
-        batch = stream[step]
-        loss = clamped_l1(decoder(batch.points, codes[batch.rows]), batch.sdf, 0.1)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-
-def test_map_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone():
-    decoder = small_decoder(width=32)
-    codes = torch.nn.Parameter(torch.randn(4, 4) * 0.5)
-    train_balls(decoder, codes)
-    before = {name: value.clone() for name, value in decoder.state_dict().items()}
-    unseen = StepBatches([FakeShape(0.47), FakeShape(0.52)], Loading(2, 256, 0, 1, 0, Augmentation(), seed=3))
-
-    def draw(step):
-        batch = unseen[step]
-        order = batch.rows.argsort()
-        return batch.points[order], batch.sdf[order]
-
-    fit = MapFit(steps=100, lr=2e-2, samples=256, spread=0.01, lambda_code=1e-4, delta=0.1)
-    fitted = fit(decoder, draw, [0, 1])
-    points, sdf = draw(1000)
-    error = clamped_l1(decoder(points, fitted), sdf, 0.1)
-    assert error < 0.3 * clamped_l1(decoder(points, torch.zeros(2, 4)), sdf, 0.1)
-    assert error < 0.02
-    assert all(torch.equal(before[name], value) for name, value in decoder.state_dict().items())
-    assert all(parameter.requires_grad for parameter in decoder.parameters())
-
-
-def test_shapes_fitted_together_get_the_codes_they_get_alone():
-    decoder = small_decoder(width=16)
-    one, two = FakeShape(0.45), FakeShape(0.6)
-    fit = MapFit(steps=20, lr=5e-3, samples=64, spread=0.01, lambda_code=1e-4, delta=0.1)
-    data = [torch.from_numpy(np.concatenate([s.outside[:32], s.inside[:32]])) for s in (one, two)]
-    together = torch.stack(data)
-    both = fit(decoder, lambda step: (together[..., :3], together[..., 3]), [3, 4])
-    for index in range(2):
-        alone_data = together[index : index + 1]
-        alone = fit(decoder, lambda step, d=alone_data: (d[..., :3], d[..., 3]), [3 + index])
-        # the prior is a mean over all numbers of all codes, hence the looseness
-        assert torch.allclose(both[index], alone[0], atol=1e-3)
-
-
-def test_fit_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        MapFit(steps=0, lr=1e-3, samples=1, spread=0.0, lambda_code=0.0, delta=0.1)
-    assert math.isfinite(MapFit(steps=1, lr=1e-3, samples=1, spread=0.0, lambda_code=0.0, delta=0.1).lr)

@@ -1,8 +1,16 @@
-"""Codes of shapes that the decoder has not seen: MAP estimation with the decoder frozen."""
+"""Codes of shapes that the decoder has not seen: MAP estimation with the decoder frozen.
+
+Two ways to the same minimum, one signature: `AdamFit`, DeepSDF's recipe, and `GaussNewtonFit`. Both find, for
+each shape alone, argmin over z of the clamped L1 to its observed distances plus lambda_code * mean z^2.
+
+Source: Park et al. 2019, equation 10.
+"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -10,13 +18,39 @@ from torch import Tensor
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 
+Draw = Callable[[int], tuple[Tensor, Tensor]]
+"""Step number -> points [B, N, 3] and sdf [B, N], the next samples of B shapes."""
+
+ROWS = 2**14
+"""Samples differentiated at a time by Gauss-Newton, or one shape's; bounds memory."""
+
+
+class Fit(Protocol):
+    """How codes are found.
+
+    Attributes:
+        samples: N, signed samples a draw and shape, half of them inside.
+    """
+
+    @property
+    def samples(self) -> int: ...
+
+    def __call__(self, decoder: Decoder, draw: Draw, seeds: Sequence[int]) -> Tensor:
+        """Codes [B, L] of B shapes, fitted side by side; each depends on its own shape alone.
+
+        Args:
+            decoder: stays as it is; its mode is restored.
+            draw: gives the samples.
+            seeds: of the B initial codes, one each, so that a code does not depend on its neighbours.
+        """
+
 
 @dataclass(frozen=True)
-class MapFit:
-    """argmin over z of the clamped L1 to observed distances plus the Gaussian prior of codes.
+class AdamFit:
+    """Adam on fresh samples at every step.
 
-    Source: Park et al. 2019, equation 10, and the recipe of its published code: 800 Adam steps, the
-    learning rate divided by 10 halfway, z from N(0, 0.01^2), prior 1e-4 * mean z^2.
+    Source: DeepSDF's published code: 800 steps, the learning rate divided by 10 halfway, z from
+    N(0, 0.01^2), prior 1e-4 * mean z^2.
 
     Args:
         steps: Adam steps, >= 1.
@@ -40,41 +74,171 @@ class MapFit:
         if min(self.steps, self.samples) < 1 or min(self.lr, self.delta) <= 0:
             raise ValueError("fit: steps and samples must be at least 1, lr and delta positive")
 
-    def __call__(
-        self, decoder: Decoder, draw: Callable[[int], tuple[Tensor, Tensor]], seeds: Sequence[int]
-    ) -> Tensor:
-        """Codes [B, L] of B shapes, fitted side by side; each depends on its own shape alone.
-
-        Args:
-            decoder: stays as it is; its mode is restored.
-            draw: step number -> points [B, N, 3] and sdf [B, N].
-            seeds: of the B initial codes, one each, so that a code does not depend on its neighbours.
-        """
-        training, frozen = decoder.training, [p for p in decoder.parameters() if p.requires_grad]
-        decoder.eval()
-        for parameter in frozen:
-            parameter.requires_grad_(False)
-        try:
-            return self._optimize(decoder, draw, seeds)
-        finally:
-            for parameter in frozen:
-                parameter.requires_grad_(True)
-            decoder.train(training)
-
     @torch.enable_grad()
-    def _optimize(self, decoder: Decoder, draw, seeds: Sequence[int]) -> Tensor:
-        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-        start = torch.stack([torch.randn(decoder.code_size, generator=each) for each in generators])
-        device = next(decoder.parameters()).device
-        codes = (start * self.spread).to(device).requires_grad_()
-        optimizer = torch.optim.Adam([codes], lr=self.lr)
-        for step in range(self.steps):
-            if step == math.ceil(self.steps * self.drop_at):
-                optimizer.param_groups[0]["lr"] = self.lr / 10
-            points, sdf = (tensor.to(device) for tensor in draw(step))
-            loss = clamped_l1(decoder(points, codes), sdf, self.delta)
-            loss = loss + self.lambda_code * codes.square().mean()
-            optimizer.zero_grad()
-            (loss * len(seeds)).backward()  # means over shapes would shrink each one's gradient
-            optimizer.step()
+    def __call__(self, decoder: Decoder, draw: Draw, seeds: Sequence[int]) -> Tensor:
+        """Codes [B, L], as `Fit` says."""
+        with frozen(decoder):
+            codes = initial_codes(decoder, self.spread, seeds).requires_grad_()
+            optimizer = torch.optim.Adam([codes], lr=self.lr)
+            for step in range(self.steps):
+                if step == math.ceil(self.steps * self.drop_at):
+                    optimizer.param_groups[0]["lr"] = self.lr / 10
+                points, sdf = (tensor.to(codes.device) for tensor in draw(step))
+                loss = clamped_l1(decoder(points, codes), sdf, self.delta)
+                loss = loss + self.lambda_code * codes.square().mean()
+                optimizer.zero_grad()
+                (loss * len(seeds)).backward()  # means over shapes would shrink each one's gradient
+                optimizer.step()
         return codes.detach()
+
+
+class Quadratic(NamedTuple):
+    """The objective of B shapes about their codes.
+
+    Args:
+        value: [B].
+        gradient: [B, L].
+        hessian: [B, L, L], positive definite where lambda_code > 0.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+@dataclass(frozen=True)
+class GaussNewtonFit:
+    """Damped Gauss-Newton steps on one draw of samples, first on a few of them, then on all.
+
+    A code has some hundred numbers and a shape thousands of residuals, so a step can solve for the code
+    instead of following its gradient; some twenty do what Adam needs hundreds for. The absolute value enters
+    as a reweighted square: |r| ~ r^2 / |r| with the weight 1 / max(|r|, smallest) held during a step. A step
+    that does not lower the true objective is not taken, and damped more.
+
+    Source: Levenberg 1944 and Marquardt 1963 (damping); Holland and Welsch 1977 (reweighting).
+
+    Args:
+        steps: most steps of a pass, >= 1.
+        samples: N, signed samples a shape, half of them inside; drawn once.
+        thinning: the first pass sees every so many-th sample, >= 1.
+        tolerance: a pass of a shape ends when a step lowers its objective by a smaller share.
+        smallest: residual below which |r| is a parabola, normalised frame, > 0.
+        spread: standard deviation of the initial codes, >= 0.
+        lambda_code: weight of the prior, >= 0.
+        delta: clamp of distances, normalised frame, > 0.
+        damping: of the first step, in units of the Hessian's mean diagonal, > 0; large ones start slowly.
+    """
+
+    steps: int
+    samples: int
+    thinning: int
+    tolerance: float
+    smallest: float
+    spread: float
+    lambda_code: float
+    delta: float
+    damping: float
+
+    def __post_init__(self):
+        if min(self.steps, self.samples, self.thinning) < 1:
+            raise ValueError("fit: steps, samples and thinning must be at least 1")
+        if min(self.delta, self.smallest, self.damping) <= 0:
+            raise ValueError("fit: delta, smallest and damping must be positive")
+
+    @torch.no_grad()
+    def __call__(self, decoder: Decoder, draw: Draw, seeds: Sequence[int]) -> Tensor:
+        """Codes [B, L], as `Fit` says."""
+        with frozen(decoder):
+            codes = initial_codes(decoder, self.spread, seeds)
+            points, sdf = (tensor.to(codes.device) for tensor in draw(0))
+            damping = torch.full_like(codes[:, 0], self.damping)
+            for every in (self.thinning, 1):
+                codes, damping = self._descend(decoder, points[:, ::every], sdf[:, ::every], codes, damping)
+        return codes
+
+    def _descend(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor, damping: Tensor):
+        """Codes [B, L] after at most `steps` steps, and the damping [B] to go on with."""
+        codes, damping = codes.clone(), damping.clone()
+        at = self._about(decoder, points, sdf, codes)
+        left = torch.arange(len(codes), device=codes.device)  # shapes that are not done
+        for _ in range(self.steps):
+            tried = codes[left] + _step(at.gradient[left], at.hessian[left], damping[left])
+            there = self._about(decoder, points[left], sdf[left], tried)
+            gain = at.value[left] - there.value
+            lower = gain > 0  # false where there is no number
+            damping[left] = torch.where(lower, damping[left] * 0.3, damping[left] * 4).clamp(1e-5, 1e6)
+            done = lower & (gain < self.tolerance * at.value[left])
+            better = left[lower]
+            codes[better] = tried[lower]
+            for old, new in zip(at, there, strict=True):
+                old[better] = new[lower]
+            left = left[~done]
+            if not len(left):
+                break
+        return codes, damping
+
+    def _about(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor) -> Quadratic:
+        """The objective of samples [B, N] about codes [B, L]."""
+        shapes = max(1, ROWS // points.shape[1])
+        parts = zip(points.split(shapes), sdf.split(shapes), codes.split(shapes), strict=True)
+        found = [self._quadratic(decoder, *part) for part in parts]
+        return Quadratic(*(torch.cat(column) for column in zip(*found, strict=True)))
+
+    def _quadratic(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor) -> Quadratic:
+        field, jacobian = field_and_jacobian(decoder, points, codes)
+        residual = field.clamp(-self.delta, self.delta) - sdf.clamp(-self.delta, self.delta)
+        weight = (field.abs() < self.delta) / residual.abs().clamp(min=self.smallest) / points.shape[1]
+        weighted = (jacobian * weight[..., None]).mT
+        hessian = weighted @ jacobian
+        prior = self.lambda_code / codes.shape[1]
+        hessian.diagonal(dim1=1, dim2=2).add_(2 * prior)
+        return Quadratic(
+            value=residual.abs().mean(1) + prior * codes.square().sum(1),
+            gradient=(weighted @ residual[..., None]).squeeze(-1) + 2 * prior * codes,
+            hessian=hessian,
+        )
+
+
+def _step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
+    """Where to go [B, L]: the minimum of a quadratic, shortened by damping [B]."""
+    diagonal = hessian.diagonal(dim1=1, dim2=2)
+    damped = hessian + torch.diag_embed((damping * diagonal.mean(1))[:, None].expand_as(diagonal))
+    return -torch.linalg.solve_ex(damped, gradient).result  # unlike solve, lets what is no number pass
+
+
+def field_and_jacobian(decoder: Decoder, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distances [B, N] and their derivatives by the code [B, N, L].
+
+    Each sample carries a copy of its shape's code, so that one backward pass gives every row.
+
+    Args:
+        points: [B, N, 3], normalised frame.
+        codes: [B, L].
+    """
+    with torch.enable_grad():
+        copies = codes.repeat_interleave(points.shape[1], 0).requires_grad_()
+        field = decoder(points.reshape(-1, 1, 3), copies).reshape(points.shape[:2])
+        (jacobian,) = torch.autograd.grad(field.sum(), copies)
+    return field.detach(), jacobian.unflatten(0, points.shape[:2])
+
+
+def initial_codes(decoder: Decoder, spread: float, seeds: Sequence[int]) -> Tensor:
+    """Codes [B, L] from N(0, spread^2), each from its own seed, on the decoder's device."""
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    start = torch.stack([torch.randn(decoder.code_size, generator=each) for each in generators])
+    return (start * spread).to(next(decoder.parameters()).device)
+
+
+@contextmanager
+def frozen(decoder: Decoder) -> Iterator[None]:
+    """The decoder in evaluation mode and without gradients of its weights; restored afterwards."""
+    training, learning = decoder.training, [p for p in decoder.parameters() if p.requires_grad]
+    decoder.eval()
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
+        decoder.train(training)

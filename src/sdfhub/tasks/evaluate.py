@@ -22,7 +22,7 @@ from sdfhub.geometry.mesher import Mesh, mesh_fields
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.fitting import MapFit
+from sdfhub.model.fitting import Fit
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.prepare import prepare_split
@@ -52,7 +52,7 @@ class Evaluation:
     points: int
     known: int | None
     held_out: int | None
-    fit: MapFit
+    fit: Fit
     fit_together: int
     pictures: int
     seed: int = 0
