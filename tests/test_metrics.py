@@ -3,6 +3,7 @@
 import dataclasses
 import time
 
+import igl
 import numpy as np
 import pytest
 import trimesh
@@ -16,6 +17,7 @@ from sdfhub.geometry.metrics import (
     summarize,
     volumetric_iou,
 )
+from sdfhub.geometry.winding import closed_winding_numbers
 from sdfhub.shapes import NormalizedMesh
 
 EMPTY = np.empty((0, 3)), np.empty((0, 3), np.int64)
@@ -111,6 +113,24 @@ def test_point_to_surface_agrees_with_the_closed_form_of_a_cube():
     outside = np.abs(points) - 0.5
     exact = np.linalg.norm(outside.clip(min=0), axis=1) + outside.max(axis=1).clip(max=0)
     assert np.allclose(point_to_surface(points, *cube()), np.abs(exact), atol=1e-12)
+
+
+def overlapping():
+    """Two shifted boxes and, inside one, a box turned inside out: winding numbers 0, 1 and 2."""
+    parts = [cube(), cube(centre=(0.3, 0.2, 0.1)), cube(0.4, (-0.2, -0.2, -0.2))]
+    parts[2] = (parts[2][0], parts[2][1][:, ::-1])
+    shift = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [part[1] + offset for part, offset in zip(parts, shift, strict=False)]
+    return np.concatenate([part[0] for part in parts]), np.concatenate(faces)
+
+
+@pytest.mark.parametrize("mesh", [icosphere(), overlapping(), cube()], ids=["ball", "overlapping", "cube"])
+def test_winding_numbers_are_the_exact_ones(mesh):
+    points = np.random.default_rng(0).uniform(-0.9, 0.9, (3000, 3))
+    counted = closed_winding_numbers(*mesh, points)
+    assert np.array_equal(counted, np.round(igl.winding_number(*mesh, points)))
+    assert len(np.unique(counted)) > 1
+    assert np.array_equal(closed_winding_numbers(mesh[0], mesh[1][:, ::-1], points), -counted)
 
 
 def test_iou_of_shifted_cubes():

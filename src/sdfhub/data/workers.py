@@ -1,4 +1,4 @@
-"""A function mapped over worker processes; a worker that dies costs one item, not the rest."""
+"""Functions mapped over worker processes; a worker that dies costs one item, not the rest."""
 
 import multiprocessing
 import os
@@ -6,8 +6,9 @@ import pickle
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection
@@ -44,6 +45,47 @@ def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[
             # Whichever item killed its worker was among the first of those left: try these one at a time.
             for index in list(left)[: 2 * workers]:
                 yield index, _alone(function, left.pop(index))
+
+
+def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[object]:
+    """function(item) of each item, in their order, worked out while the caller makes the next items.
+
+    At most two items a worker wait. Where a worker dies, what is left is worked out here.
+
+    Args:
+        function: picklable; its exceptions are raised here.
+        items: picklable; taken one by one.
+        workers: processes, as in `map_in_processes`; 0 for none but this one.
+    """
+    if workers < 1:
+        yield from map(function, items)
+        return
+    waiting: deque[tuple[object, Future | None]] = deque()
+    pool = _pool(workers, function)
+    try:
+        for item in items:
+            waiting.append((item, _submitted(pool, function, item)))
+            if len(waiting) > 2 * workers:
+                yield _result(function, *waiting.popleft())
+        while waiting:
+            yield _result(function, *waiting.popleft())
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _submitted(pool: ProcessPoolExecutor, function: Callable, item: object) -> Future | None:
+    try:
+        with _startable(function):
+            return pool.submit(_call, item)
+    except BrokenProcessPool:
+        return None
+
+
+def _result(function: Callable, item: object, future: Future | None) -> object:
+    try:
+        return function(item) if future is None else future.result()
+    except BrokenProcessPool:
+        return function(item)
 
 
 def _map_until_crash(function: Callable, items: dict, workers: int) -> Iterator[tuple[int, object]]:

@@ -13,12 +13,13 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sdfhub.geometry.winding import closed_winding_numbers
 from sdfhub.shapes import NormalizedMesh
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
 IOU_POINTS = 20_000
-"""Uniform points for the volumetric IoU; their winding numbers are the dearest part of a judgement."""
+"""Uniform points for the volumetric IoU."""
 
 FAILURES = (
     "failed: shapes without a reconstructed surface. They enter no statistic but cd_mean_with_failures and "
@@ -111,6 +112,22 @@ def judge(
     )
 
 
+@dataclass(frozen=True)
+class Judge:
+    """`judge` with its settings fixed, as a worker process is handed it.
+
+    Args:
+        points, seed: as in `judge`.
+    """
+
+    points: int
+    seed: int
+
+    def __call__(self, pair: tuple[Mesh, NormalizedMesh]) -> ShapeMetrics:
+        """The judgement of a reconstruction against the true mesh."""
+        return judge(*pair, points=self.points, seed=self.seed)
+
+
 def sample_surface(
     vertices: np.ndarray, faces: np.ndarray, count: int, seed: int | tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +177,7 @@ def chamfer(a: np.ndarray, b: np.ndarray) -> float:
 def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> float | None:
     """Volume inside both meshes over volume inside either, from uniform points in their joint bounding box.
 
-    A point is inside where the winding number exceeds 1/2.
+    A point is inside where the winding number is positive.
 
     Args:
         a, b: vertices and faces in one frame.
@@ -175,8 +192,7 @@ def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> 
     corners = np.concatenate([mesh[0][mesh[1].ravel()] for mesh in (a, b)])
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = np.random.default_rng(seed).uniform(low, high, (count, 3))
-    points = points[_by_cell(points)]
-    inside = [igl.fast_winding_number(v, f, points) > 0.5 for v, f in (a, b)]
+    inside = [closed_winding_numbers(*mesh, points) > 0 for mesh in (a, b)]
     union = np.count_nonzero(inside[0] | inside[1])
     return float(np.count_nonzero(inside[0] & inside[1]) / union) if union else None
 

@@ -1,5 +1,6 @@
 """Task `evaluate`: a trained shape space is meshed and judged, known and held-out shapes apart."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,17 +18,22 @@ from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import shape_seed
+from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
-from sdfhub.geometry.metrics import judge
+from sdfhub.geometry.metrics import Judge
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fitting import Fit
+from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.prepare import prepare_split
 from sdfhub.tasks.run import load_autodecoder, read_run
 from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
+
+WORTH_A_PROCESS = 4
+"""Shapes to judge for which a worker process is started: it takes as long to start as to judge one or two."""
 
 BATCH = 2**16
 """Points a call when signed distances are judged; bounds memory, not the result."""
@@ -45,6 +51,7 @@ class Evaluation:
         fit: how codes of held-out shapes are found.
         fit_together: held-out shapes fitted side by side, >= 1.
         pictures: shapes of each role on the contact sheet.
+        workers: processes that judge, >= 0; None for one per core.
         seed: of every draw.
     """
 
@@ -55,13 +62,14 @@ class Evaluation:
     fit: Fit
     fit_together: int
     pictures: int
+    workers: int | None = None
     seed: int = 0
 
     def __post_init__(self):
         if self.resolution < 2 or min(self.points, self.fit_together) < 1:
             raise ValueError("resolution must be at least 2, points and fit_together at least 1")
-        if min(self.known or 0, self.held_out or 0, self.pictures) < 0:
-            raise ValueError("known, held_out and pictures must not be negative")
+        if min(self.known or 0, self.held_out or 0, self.pictures, self.workers or 0) < 0:
+            raise ValueError("known, held_out, pictures and workers must not be negative")
 
 
 def evaluate_model(
@@ -97,8 +105,7 @@ def evaluate_model(
     if any(shape.mesh is None for _, shape, _ in roles):
         rows = [(role, shape, distance_errors(model.decoder, code, shape)) for role, shape, code in roles]
         return write_distances(rows, training, out)
-    bar = tqdm(roles, desc="judging", unit="shape", leave=False, disable=None)
-    return write_scores([_judge(*row, model.decoder, evaluation) for row in bar], evaluation, training, out)
+    return write_scores(judge_all(model.decoder, roles, evaluation), evaluation, training, out)
 
 
 def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:
@@ -122,10 +129,30 @@ def _drawn(shapes: list[StoredShape], seeds: list[int], samples: int, step: int)
     return drawn[..., :3], drawn[..., 3]
 
 
-def _judge(role: str, shape: StoredShape, code: Tensor, decoder: Decoder, evaluation: Evaluation) -> Judged:
-    [(vertices, faces)] = reconstruct(decoder, code[None], evaluation.resolution)
-    metrics = judge((vertices, faces), shape.mesh, points=evaluation.points, seed=evaluation.seed)
-    return Judged(role, shape, metrics, vertices, faces)
+def judge_all(
+    decoder: Decoder, roles: Sequence[tuple[str, StoredShape, Tensor]], evaluation: Evaluation
+) -> list[Judged]:
+    """Reconstructs shapes one after another, while worker processes judge those before.
+
+    Args:
+        decoder: in evaluation mode.
+        roles: role, shape and code [L] of each.
+        evaluation: how to judge; its `workers` change speed, not scores.
+    """
+    meshes = []
+
+    def pairs() -> Iterator[tuple[Mesh, NormalizedMesh]]:
+        for _, shape, code in tqdm(roles, desc="judging", unit="shape", leave=False, disable=None):
+            meshes.extend(reconstruct(decoder, code[None], evaluation.resolution))
+            yield meshes[-1], shape.mesh
+
+    workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
+    workers = min(workers, len(roles) // WORTH_A_PROCESS)
+    metrics = stream_in_processes(Judge(evaluation.points, evaluation.seed), pairs(), workers)
+    return [
+        Judged(role, shape, row, *mesh)
+        for (role, shape, _), row, mesh in zip(roles, list(metrics), meshes, strict=True)
+    ]
 
 
 def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:

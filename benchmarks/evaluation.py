@@ -1,0 +1,111 @@
+"""Judging reconstructions: shapes a minute, and what a thousand take.
+
+    python benchmarks/evaluation.py [--chamfer 1000] [--judged 60] [--space RUN --resolutions 128 256]
+
+Truth: procedural chairs. In the place of a reconstruction: the same chair with each face split until there are
+some 100,000, its vertices moved by noise of 0.002. Three things are timed: the Chamfer distance alone
+(sampling both sides and comparing), on --chamfer chairs, one process; all metrics of `judge`, on --judged of
+them, in this process and in one worker a core; and, given a trained space, `sdfhub evaluate` on its first
+known shapes, meshing included. What is not run on 1000 shapes is extrapolated, and says so. Peak memory is of
+this process or of its largest worker.
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from runs import ROOT
+
+from sdfhub.data.normalize import normalize_mesh
+from sdfhub.data.preparation import DEFAULT
+from sdfhub.data.procedural import generate
+from sdfhub.data.workers import stream_in_processes
+from sdfhub.geometry.metrics import Judge, Mesh, chamfer, sample_surface
+from sdfhub.shapes import NormalizedMesh
+
+FACES = 50_000
+"""A twin is split until it has more."""
+
+
+def pairs(count: int) -> Iterator[tuple[Mesh, NormalizedMesh]]:
+    for index in range(count):
+        truth = normalize_mesh(*generate("chairs", index), DEFAULT)
+        vertices, faces = truth.vertices, truth.faces
+        while len(faces) < FACES:
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        noise = np.random.default_rng(index).normal(scale=0.002, size=vertices.shape)
+        yield (vertices + noise, faces), truth
+
+
+def time_chamfer(count: int) -> None:
+    spent, distances, faces = 0.0, [], []
+    for mesh, truth in pairs(count):
+        start = time.perf_counter()
+        have, _ = sample_surface(*mesh, 30_000, (0, 2))
+        want, _ = sample_surface(truth.vertices, truth.faces, 30_000, (0, 0))
+        distances.append(chamfer(have, want))
+        spent += time.perf_counter() - start
+        faces.append(len(mesh[1]))
+    line(f"Chamfer alone, 1 process, {np.median(faces):.0f} faces", count, spent)
+
+
+def time_judge(count: int) -> None:
+    ready = list(pairs(count))
+    for workers in (0, os.cpu_count()):
+        stream = stream_in_processes(Judge(30_000, 0), ready, workers)
+        next(stream)  # processes have started
+        start = time.perf_counter()
+        judged = 1 + len(list(stream))
+        line(f"all metrics, {workers or 'this'} process(es)", judged, time.perf_counter() - start)
+
+
+def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "sdfhub",
+        "evaluate",
+        f"run={space}",
+        f"evaluate.resolution={resolution}",
+    ]
+    with tempfile.TemporaryDirectory() as out:
+        command += [f"evaluate.known={shapes}", "evaluate.held_out=0", f"out={out}"]
+        start = time.perf_counter()
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        line(f"sdfhub evaluate at {resolution}^3, start included", shapes, time.perf_counter() - start)
+
+
+def line(name: str, shapes: int, seconds: float) -> None:
+    kind = "run" if shapes >= 1000 else "extrapolated"
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    cells = [name, shapes, f"{seconds:.1f}", f"{60 * shapes / seconds:.0f}"]
+    cells += [f"{1000 / shapes * seconds / 60:.1f} ({kind})", f"{peak / 2**20:.2f}"]
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--chamfer", type=int, default=1000, help="chairs for the Chamfer distance alone")
+    parser.add_argument("--judged", type=int, default=60, help="chairs for all metrics")
+    parser.add_argument("--space", type=Path, help="folder of a trained run")
+    parser.add_argument("--resolutions", type=int, nargs="+", default=[128, 256])
+    parser.add_argument("--known", type=int, default=16, help="shapes of the space to evaluate")
+    arguments = parser.parse_args()
+    print("| what | shapes | seconds | shapes a minute | minutes for 1000 | peak GiB |")
+    print("| --- " * 6 + "|")
+    time_chamfer(arguments.chamfer)
+    time_judge(arguments.judged)
+    for resolution in arguments.resolutions if arguments.space else ():
+        time_evaluation(arguments.space.resolve(), resolution, arguments.known)
+
+
+if __name__ == "__main__":
+    main()

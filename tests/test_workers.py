@@ -1,0 +1,26 @@
+"""Items streamed through worker processes; light imports, since a worker repeats them."""
+
+import os
+
+from sdfhub.data.workers import stream_in_processes
+
+
+class DiesElsewhere:
+    """A square, or the end of the process unless it is the one that it was made in."""
+
+    def __init__(self):
+        self.home = os.getpid()
+
+    def __call__(self, number: int) -> int:
+        if number == 6 and os.getpid() != self.home:
+            os._exit(1)
+        return number**2
+
+
+def test_a_stream_takes_items_one_by_one_keeps_their_order_and_survives_its_workers():
+    taken = []
+    items = (taken.append(number) or number for number in range(10))
+    stream = stream_in_processes(DiesElsewhere(), items, workers=1)
+    assert next(stream) == 0
+    assert len(taken) <= 3
+    assert list(stream) == [number**2 for number in range(1, 10)]
