@@ -2,12 +2,12 @@
 
     python benchmarks/evaluation.py [--chamfer 1000] [--judged 60] [--space RUN --resolutions 128 256]
 
-Truth: procedural chairs. In the place of a reconstruction: the same chair with each face split until there are
-some 100,000, its vertices moved by noise of 0.002. Three things are timed: the Chamfer distance alone
+Truth: procedural chairs. In the place of a reconstruction: the same chair with each face split until there
+are some 100,000, its vertices moved by noise of 0.002. Three things are timed: the Chamfer distance alone
 (sampling both sides and comparing), on --chamfer chairs, one process; all metrics of `judge`, on --judged of
 them, in this process and in one worker a core; and, given a trained space, `sdfhub evaluate` on its first
-known shapes, meshing included. What is not run on 1000 shapes is extrapolated, and says so. Peak memory is of
-this process or of its largest worker.
+known shapes, meshing included. What is not run on 1000 shapes is extrapolated, and says so. Peak memory: of
+this process so far, or of its largest child.
 """
 
 import argparse
@@ -77,7 +77,8 @@ def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
         f"evaluate.resolution={resolution}",
     ]
     with tempfile.TemporaryDirectory() as out:
-        command += [f"evaluate.known={shapes}", "evaluate.held_out=0", f"out={out}"]
+        command += [f"evaluate.resolution={resolution}", f"evaluate.known={shapes}"]
+        command += ["evaluate.held_out=0", f"out={out}"]
         start = time.perf_counter()
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
         line(f"sdfhub evaluate at {resolution}^3, start included", shapes, time.perf_counter() - start)
