@@ -46,15 +46,15 @@ def pairs(count: int) -> Iterator[tuple[Mesh, NormalizedMesh]]:
 
 
 def time_chamfer(count: int) -> None:
-    spent, distances, faces = 0.0, [], []
+    spent, processor, faces = 0.0, 0.0, []
     for mesh, truth in pairs(count):
-        start = time.perf_counter()
+        start, at = time.perf_counter(), time.process_time()
         have, _ = sample_surface(*mesh, 30_000, (0, 2))
         want, _ = sample_surface(truth.vertices, truth.faces, 30_000, (0, 0))
-        distances.append(chamfer(have, want))
-        spent += time.perf_counter() - start
+        chamfer(have, want)
+        spent, processor = spent + time.perf_counter() - start, processor + time.process_time() - at
         faces.append(len(mesh[1]))
-    line(f"Chamfer alone, 1 process, {np.median(faces):.0f} faces", count, spent)
+    line(f"Chamfer alone, 1 process, {np.median(faces):.0f} faces", count, spent, processor)
 
 
 def time_judge(count: int) -> None:
@@ -62,9 +62,11 @@ def time_judge(count: int) -> None:
     for workers in (0, os.cpu_count()):
         stream = stream_in_processes(Judge(30_000, 0), ready, workers)
         next(stream)  # processes have started
-        start = time.perf_counter()
-        judged = 1 + len(list(stream))
-        line(f"all metrics, {workers or 'this'} process(es)", judged, time.perf_counter() - start)
+        start, at = time.perf_counter(), time.process_time()
+        judged = len(list(stream))
+        spent, processor = time.perf_counter() - start, time.process_time() - at
+        where = f"{workers} worker processes" if workers else "1 process"
+        line(f"all metrics, {where}", judged, spent, None if workers else processor)
 
 
 def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
@@ -84,10 +86,16 @@ def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
         line(f"sdfhub evaluate at {resolution}^3, start included", shapes, time.perf_counter() - start)
 
 
-def line(name: str, shapes: int, seconds: float) -> None:
+def line(name: str, shapes: int, seconds: float, processor: float | None = None) -> None:
     kind = "run" if shapes >= 1000 else "extrapolated"
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    cells = [name, shapes, f"{seconds:.1f}", f"{60 * shapes / seconds:.0f}"]
+    cells = [
+        name,
+        shapes,
+        f"{seconds:.1f}",
+        "" if processor is None else f"{processor:.1f}",
+        f"{60 * shapes / seconds:.0f}",
+    ]
     cells += [f"{1000 / shapes * seconds / 60:.1f} ({kind})", f"{peak / 2**20:.2f}"]
     print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
@@ -100,8 +108,8 @@ def main() -> None:
     parser.add_argument("--resolutions", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--known", type=int, default=16, help="shapes of the space to evaluate")
     arguments = parser.parse_args()
-    print("| what | shapes | seconds | shapes a minute | minutes for 1000 | peak GiB |")
-    print("| --- " * 6 + "|")
+    print("| what | shapes | seconds | of a processor | shapes a minute | minutes for 1000 | peak GiB |")
+    print("| --- " * 7 + "|")
     time_chamfer(arguments.chamfer)
     time_judge(arguments.judged)
     for resolution in arguments.resolutions if arguments.space else ():
