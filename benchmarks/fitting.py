@@ -7,7 +7,7 @@ shapes are fitted by `fit=gauss_newton` side by side, twice (two seeds: start an
 noise; the first --reference of them also by `fit=deepsdf` (800 Adam steps x 8000 samples) one by one, between
 the two. One thread; seconds are the processor's, so that other programs do not count. Objective: clamped
 L1 + prior on 40,000 fresh samples. CD: at 128^3, 30,000 points a side. Both times 10^3. The last table
-compares the same shapes by both; noise: the same difference between Gauss-Newton's two seeds on all shapes.
+compares the same shapes by both; noise: median |difference| of the two seeds on all shapes.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def quality(decoder: Decoder, shape: StoredShape, code: torch.Tensor) -> tuple[f
     rows = torch.from_numpy(signed_samples(shape, FRESH, np.random.default_rng(2**40)))[None]
     field = decoder(rows[..., :3], code[None])
     objective = clamped_l1(field, rows[..., 3], 0.1) + 1e-4 * code.square().mean()
-    cd = judge(reconstruct(decoder, code, 128), shape.mesh).cd
+    cd = judge(*reconstruct(decoder, code[None], 128), shape.mesh).cd
     return float(objective) * 1e3, np.nan if cd is None else cd * 1e3
 
 
