@@ -149,11 +149,17 @@ class GaussNewtonFit:
     def __call__(self, decoder: Decoder, draw: Draw, seeds: Sequence[int]) -> Tensor:
         """Codes [B, L], as `Fit` says."""
         with frozen(decoder):
-            codes = initial_codes(decoder, self.spread, seeds)
-            points, sdf = (tensor.to(codes.device) for tensor in draw(0))
-            damping = torch.full_like(codes[:, 0], self.damping)
-            for every in (self.thinning, 1):
-                codes, damping = self._descend(decoder, points[:, ::every], sdf[:, ::every], codes, damping)
+            start = initial_codes(decoder, self.spread, seeds)
+            drawn = (tensor.to(start.device) for tensor in draw(0))
+            # a CPU is as fast with one shape at a time, and then no neighbour changes even a rounding
+            together = 1 if start.device.type == "cpu" else len(start)
+            groups = zip(start.split(together), *(tensor.split(together) for tensor in drawn), strict=True)
+            return torch.cat([self._fit(decoder, *group) for group in groups])
+
+    def _fit(self, decoder, codes: Tensor, points: Tensor, sdf: Tensor) -> Tensor:
+        damping = torch.full_like(codes[:, 0], self.damping)
+        for every in (self.thinning, 1):
+            codes, damping = self._descend(decoder, points[:, ::every], sdf[:, ::every], codes, damping)
         return codes
 
     def _descend(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor, damping: Tensor):
