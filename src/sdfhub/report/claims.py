@@ -56,7 +56,7 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, str]:
     (left, a), (right, b) = sides
     limit = "" if below.factor == 1 else f"{below.factor:.2g} x "
     holds = a.mean < below.factor * b.mean
-    sign = "<" if holds else "is not <"
+    sign = "<" if holds else "not <"
     what = below.quantity.replace("_", " ") + (" of held-out shapes" if below.role == "held_out" else "")
     text = f"{what}: {left} {_told(a, below.quantity)} {sign} {limit}{right} {_told(b, below.quantity)}"
     return holds, text + (" (intervals overlap)" if _overlap(a, b, below.factor) else "")

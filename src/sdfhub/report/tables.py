@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sdfhub.report.claims import verdicts
 from sdfhub.report.paper import COSTS, PRINTED
 from sdfhub.report.results import ROLES
 from sdfhub.report.rows import THOUSANDFOLD, Estimate, Group, Row
@@ -134,6 +135,15 @@ def _missing(group: Group) -> list[Table]:
         if cell.state != "done"
     ]
     return [Table(f"Not there: {group.title}", ["cell", "state", "reason"], lines, [])] if lines else []
+
+
+def claims_table(group: Group) -> Table:
+    """Every claim of the paper with its verdict and the figures behind it."""
+    rows = [
+        [one.claim.text, one.claim.source, one.state, "; ".join([*one.figures, one.claim.note]).strip("; ")]
+        for one in verdicts(group)
+    ]
+    return Table(f"Claims of the paper: {group.title}", ["claim", "source", "verdict", "figures"], rows, [])
 
 
 def duration(seconds: float) -> str:

@@ -14,7 +14,7 @@ from sdfhub.report.meshes import FindTruth
 from sdfhub.report.page import page
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import Group, group_cells
-from sdfhub.report.tables import csv_text, latex, markdown, tables
+from sdfhub.report.tables import claims_table, csv_text, latex, markdown, tables
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.run import write_text
@@ -35,7 +35,8 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     groups = group_cells(cells)
     all_tables = [table for group in groups for table in tables(group)]
     print("\n" + markdown(all_tables))
-    write_text(out / "table.md", f"# {sweep.name}\n\n{markdown(all_tables)}")
+    claims = [claims_table(group) for group in groups]
+    write_text(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims])}")
     write_text(out / "table.tex", latex(all_tables))
     write_text(out / "table.csv", csv_text(groups))
     write_text(out / "report.html", page(sweep.name, cells, groups, truth_finder(groups), shapes))
@@ -84,8 +85,9 @@ def report(config: dict[str, Any]) -> None:
 
 def main() -> None:
     """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    if len(sys.argv) > 1 and "=" not in sys.argv[1] and not sys.argv[1].startswith("-"):
-        quoted = sys.argv[1].replace("\\", "\\\\").replace("'", "\\'")
+    first = sys.argv[1] if len(sys.argv) > 1 else "-"
+    if Path(first).is_dir() or (not first.startswith("-") and "=" not in first):
+        quoted = first.replace("\\", "\\\\").replace("'", "\\'")
         sys.argv[1] = f"sweep='{quoted}'"  # quoted, so that Hydra takes any path as text
 
     def task(config: DictConfig) -> None:

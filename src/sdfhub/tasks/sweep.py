@@ -55,17 +55,23 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
     Args:
         config: of the multirun, Hydra's own part included.
     """
+    loader = GlobalHydra.instance().config_loader()
+    return [as_planned(loader.load_sweep_config(config, job)) for job in jobs(config)]
+
+
+def jobs(config: DictConfig) -> list[list[str]]:
+    """The overrides of each cell, as Hydra's own sweeper makes them."""
     if not str(config.hydra.sweeper._target_).endswith(".BasicSweeper"):
         return []
-    loader = GlobalHydra.instance().config_loader()
     params = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
     words = [f"{key}={value}" for key, value in params.items()] + list(config.hydra.overrides.task)
-    overrides = OverridesParser.create(config_loader=loader).parse_overrides(words)
-    (jobs,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
-    return [_planned(loader.load_sweep_config(config, list(job))) for job in jobs]
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    (batch,) = BasicSweeper.split_arguments(parser.parse_overrides(words), max_batch_size=None)
+    return batch
 
 
-def _planned(config: DictConfig) -> PlannedCell:
+def as_planned(config: DictConfig) -> PlannedCell:
+    """A composed cell as `sweep.json` keeps it; Hydra's own part leaves the config."""
     with open_dict(config):
         folder = str(config.hydra.sweep.subdir)
         hydra = config.pop("hydra")
