@@ -262,9 +262,10 @@ def test_a_cell_under_new_defaults_replaces_its_old_one_in_the_plan(tmp_path):
 
 
 def test_a_lock_is_held_once_and_freed(tmp_path):
-    with locked(tmp_path / ".lock", wait=False) as first, locked(tmp_path / ".lock", wait=False) as second:
+    path = tmp_path / ".lock"
+    with locked(path, patience=0) as first, locked(path, patience=0.2) as second:
         assert (first, second) == (True, False)
-    with locked(tmp_path / ".lock", wait=False) as third:
+    with locked(path, patience=0) as third:
         assert third
 
 
@@ -309,3 +310,22 @@ def test_scores_are_what_training_writes():
 
     assert set(ShapeScore.model_fields) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
     assert set(score("x", 1.0)) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
+
+
+def test_a_significant_difference_needs_intervals_apart_and_noise_is_said(tmp_path):
+    text = "Normals significantly improve the accuracy of SIREN, FFT/SIREN and FFT/HOSC"
+    for name, spread, state in (("far", 0.01, "holds"), ("near", 0.5, "does not hold")):
+        for method in ("SIREN", "FFT/SIREN", "FFT/HOSC"):
+            for seed, shift in enumerate((-spread, 0, spread)):
+                for normals, cd in (("on", 1e-3), ("off", 1.5e-3)):
+                    write_cell(tmp_path / name, planned(method, normals, seed), [cd * (1 + shift)])
+        found = {one.claim.text: one for one in verdicts(only_group(tmp_path / name))}
+        assert found[text].state == state
+        assert found["Positional encoding counters the overfitting of periodic activations alone"].state == (
+            "not tested"
+        )
+    for normals, seed, cd in (("off", 0, 1e-3), ("off", 1, 3e-3)):
+        write_cell(tmp_path / "near", planned("DeepSDF", normals, seed), [cd])
+    found = {one.claim.text: one for one in verdicts(only_group(tmp_path / "near"))}
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert (surpasses.state, surpasses.within_noise) == ("holds", True)

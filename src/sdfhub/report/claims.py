@@ -15,11 +15,18 @@ class Verdict:
         claim: what was claimed.
         state: `not tested` where a figure that could decide it is missing.
         figures: the figures behind the verdict, or what is missing, one comparison each.
+        within_noise: confidence intervals over seeds overlap in a comparison behind the verdict.
     """
 
     claim: Claim
     state: Literal["holds", "does not hold", "not tested"]
     figures: list[str]
+    within_noise: bool = False
+
+    @property
+    def told(self) -> str:
+        """The verdict in words, with its doubt."""
+        return self.state + (" (within seed noise)" if self.within_noise else "")
 
 
 def verdicts(group: Group) -> list[Verdict]:
@@ -34,24 +41,26 @@ def _verdict(claim: Claim, group: Group) -> Verdict:
     if claim.sweep and claim.sweep != sweep:
         return Verdict(claim, "not tested", [f"tested by sweeps={claim.sweep}"])
     outcomes = [_compared(below, group) for below in claim.rule]
-    told = list(dict.fromkeys(text for _, text in outcomes))
-    known = [outcome for outcome, _ in outcomes]
+    known = [holds if not (claim.apart and overlap) else False for holds, overlap, _ in outcomes]
     if claim.needs == "all":
         state = False if False in known else None if None in known else True
     else:
         state = True if True in known else None if None in known else False
-    return Verdict(claim, {True: "holds", False: "does not hold", None: "not tested"}[state], told)
+    words = {True: "holds", False: "does not hold", None: "not tested"}[state]
+    decisive = [overlap for (_, overlap, _), one in zip(outcomes, known, strict=True) if one is state]
+    noise = state is not None and not claim.apart and any(decisive)
+    return Verdict(claim, words, list(dict.fromkeys(text for *_, text in outcomes)), noise)
 
 
-def _compared(below: Below, group: Group) -> tuple[bool | None, str]:
-    """Whether the comparison holds (None: cannot be said), and its figures in words."""
+def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
+    """Whether the comparison holds (None: cannot be said), if intervals overlap, the figures in words."""
     sides = []
     for name in (below.left, below.right):
         row = group.row(*name)
         value = row.estimate(below.quantity, below.role) if row else None
         if value is None:
             shown = row.label if row else f"{name[0]}, normals {name[1]}"
-            return None, f"not there: {shown}"
+            return None, False, f"not there: {shown}"
         sides.append((row.label, value))
     (left, a), (right, b) = sides
     limit = "" if below.factor == 1 else f"{below.factor:.2g} x "
@@ -59,7 +68,8 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, str]:
     sign = "<" if holds else "not <"
     what = below.quantity.replace("_", " ") + (" of held-out shapes" if below.role == "held_out" else "")
     text = f"{what}: {left} {_told(a, below.quantity)} {sign} {limit}{right} {_told(b, below.quantity)}"
-    return holds, text + (" (intervals overlap)" if _overlap(a, b, below.factor) else "")
+    overlap = _overlap(a, b, below.factor)
+    return holds, overlap, text + (" (intervals overlap)" if overlap else "")
 
 
 def _overlap(a: Estimate, b: Estimate, factor: float) -> bool:

@@ -59,6 +59,7 @@ class Claim:
         needs: `all` of them, or `any` one.
         sweep: the only sweep that tests it; "" for each that has the rows.
         note: what a reader of the verdict should know.
+        apart: confidence intervals that overlap do not bear it out.
     """
 
     text: str
@@ -67,6 +68,7 @@ class Claim:
     needs: Literal["all", "any"] = "all"
     sweep: str = ""
     note: str = ""
+    apart: bool = False
 
 
 def _beats(
@@ -142,6 +144,8 @@ CLAIMS = (
             for method in ("SIREN", "FFT/SIREN", "FFT/HOSC")
             for quantity in _BOTH
         ),
+        note="significantly: intervals over seeds must not overlap, where there are seeds",
+        apart=True,
     ),
     Claim(
         "Hash encoding fails to learn the full space of shapes",

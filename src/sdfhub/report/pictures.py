@@ -58,7 +58,7 @@ class Gallery:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
         columns = [f"{id} ({'known' if role == 'known' else 'held out'})" for role, id in shown]
-        truth = [Tile(self._truth_image(id), "", f"truth of {id}") for _, id in shown]
+        truth = [Tile(self._truth_image(id), "", "no truth") for _, id in shown]
         rows = [("Ground truth", truth)] if any(tile.image for tile in truth) else []
         for row in group.rows:
             if row.done:
@@ -101,7 +101,7 @@ class Gallery:
         return found
 
     def _pair(self, row: Row, shape: ShapeScore) -> list[Tile]:
-        truth = Tile(self._truth_image(shape.id), shape.id, f"truth of {shape.id}")
+        truth = Tile(self._truth_image(shape.id), shape.id, "no truth")
         return [truth, self._tile(row, "known", shape.id)]
 
     def _tile(self, row: Row, role: str, id: str) -> Tile:

@@ -6,6 +6,7 @@ seed lie side by side, and a cell whose settings have changed since is supersede
 
 import json
 import os
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,28 +84,34 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell]) -> None:
 
 
 @contextmanager
-def locked(path: Path, wait: bool = True) -> Iterator[bool]:
-    """Holds a lock file; gives False where another process holds it and `wait` is off.
+def locked(path: Path, patience: float = float("inf")) -> Iterator[bool]:
+    """Holds a lock file; gives False where another process still holds it after `patience` seconds.
 
     The system releases it when the process ends, however it ends. Where locks do not work (some network
     disks, Windows), every process gets it.
     """
+    limit = time.monotonic() + patience
     with path.open("w") as file:
-        try:
-            import fcntl
+        while not (ours := _lock(file)) and time.monotonic() < limit:
+            time.sleep(0.1)
+        yield ours
 
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield False
-            return
-        except (ImportError, OSError):
-            pass
-        yield True
+
+def _lock(file) -> bool:
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        pass
+    return True
 
 
 def is_locked(path: Path) -> bool:
     """Whether another process holds the lock file now."""
     if not path.exists() or not os.access(path, os.W_OK):
         return False
-    with locked(path, wait=False) as free:
+    with locked(path, patience=0) as free:
         return not free

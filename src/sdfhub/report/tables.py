@@ -57,7 +57,7 @@ def _scores(group: Group, role: str) -> Table:
         cells += [_ratio(group, row, q, role) for q in ("excess_mean", "excess_median") if rivals]
         rows.append([row.label, *cells])
     notes = [
-        "CD, floor and excess times 10^3, normalised frame; excess is CD above the noise floor of two "
+        "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
         "samplings of the truth. Shapes without a surface count with the CD of a single point. "
         "± is a 95% confidence interval over seeds (Student's t)."
     ]
@@ -140,7 +140,7 @@ def _missing(group: Group) -> list[Table]:
 def claims_table(group: Group) -> Table:
     """Every claim of the paper with its verdict and the figures behind it."""
     rows = [
-        [one.claim.text, one.claim.source, one.state, "; ".join([*one.figures, one.claim.note]).strip("; ")]
+        [one.claim.text, one.claim.source, one.told, "; ".join([*one.figures, one.claim.note]).strip("; ")]
         for one in verdicts(group)
     ]
     return Table(f"Claims of the paper: {group.title}", ["claim", "source", "verdict", "figures"], rows, [])
@@ -214,6 +214,7 @@ LATEX = {
     "~": r"\textasciitilde{}",
     "±": r"$\pm$",
     "–": "--",
+    "³": r"\textsuperscript{3}",
     "<": r"\textless{}",
     ">": r"\textgreater{}",
 } | {character: f"\\{character}" for character in "&%$#"}

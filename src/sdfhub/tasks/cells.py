@@ -39,7 +39,7 @@ def run_cell(
     folder = Path(hydra.runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
     enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
-    with locked(folder / ".lock", wait=False) as ours:
+    with locked(folder / ".lock", patience=1) as ours:  # a report holds it for a moment, a training for hours
         if not ours:
             print(f"cell: {folder}: another process is training it", flush=True)
             return {}

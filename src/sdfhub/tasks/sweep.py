@@ -11,7 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from sdfhub.errors import SdfhubError
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
+from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
 from sdfhub.tasks.cells import planned_cell
 from sdfhub.tasks.report import write_report
 
@@ -43,9 +43,10 @@ class SweepRecord(Callback):
             write_report(sweep, sweep / "report")
         except SdfhubError as error:
             print(f"sdfhub: error: {error}", file=sys.stderr)
-        failed = [cell for cell in self._planned if (sweep / cell.folder / FAILURE).exists()]
+        cells = self._planned or read_plan(sweep)
+        failed = [cell for cell in cells if (sweep / cell.folder / FAILURE).exists()]
         if failed:
-            print(f"sdfhub: error: {len(failed)} of {len(self._planned)} cells failed", file=sys.stderr)
+            print(f"sdfhub: error: {len(failed)} of {len(cells)} cells failed", file=sys.stderr)
             sys.exit(1)
 
 
