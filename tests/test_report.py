@@ -13,6 +13,7 @@ import pytest
 
 from sdfhub.errors import SdfhubError
 from sdfhub.report.claims import verdicts
+from sdfhub.report.formats import csv_text, latex, markdown
 from sdfhub.report.meshes import Mesh, reconstruction
 from sdfhub.report.page import page
 from sdfhub.report.paper import CLAIMS, COSTS, PRINTED
@@ -20,7 +21,7 @@ from sdfhub.report.pictures import packed
 from sdfhub.report.plan import PLAN, enter_cells, locked, read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
-from sdfhub.report.tables import claims_table, csv_text, latex, markdown, tables
+from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks import report as report_task
 from sdfhub.tasks.report import write_report
 from tests.sweep_folders import planned, score, write_cell, write_mesh

@@ -10,11 +10,12 @@ from omegaconf import DictConfig
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.store import Store, preparation_hash
 from sdfhub.errors import SdfhubError
+from sdfhub.report.formats import csv_text, latex, markdown
 from sdfhub.report.meshes import FindTruth
 from sdfhub.report.page import page
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import Group, group_cells
-from sdfhub.report.tables import claims_table, csv_text, latex, markdown, tables
+from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.run import write_text
