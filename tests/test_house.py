@@ -10,9 +10,10 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "sdfhub"
 FILES = sorted(SOURCE.rglob("*.py"))
 FORBIDDEN_IMPORTS = {
-    "data": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.model", "sdfhub.geometry"),
-    "model": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.data", "sdfhub.geometry"),
-    "geometry": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.data", "sdfhub.model"),
+    "data": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.model", "sdfhub.geometry"),
+    "model": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.data", "sdfhub.geometry"),
+    "geometry": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.data", "sdfhub.model"),
+    "report": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.model"),
 }
 FORBIDDEN_NAMES = {"utils", "util", "helpers", "helper", "manager", "base", "common"}
 MACHINE_PATH = re.compile(r"""["'`(\s=](/(?:home|work|tmp|root|Users|mnt|data|opt|scratch)/\w|[A-Z]:\\\w)""")

@@ -9,17 +9,15 @@ from difflib import get_close_matches
 from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import sdfhub
 from sdfhub.errors import SdfhubError
+from sdfhub.tasks.names import cell_name, run_name, sweep_name
 
-NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
-
-TASK_CONFIGS = ("config.yaml", "evaluate.yaml")
+TASK_CONFIGS = ("config.yaml", "evaluate.yaml", "report.yaml")
 """Configs whose top-level keys tasks read."""
 
 
@@ -30,18 +28,10 @@ def configuration_folder() -> Path:
     return inside if inside.is_dir() else package.parents[1] / "conf"
 
 
-def run_name() -> str:
-    """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
-    choices = HydraConfig.get().runtime.choices
-    parts = [
-        f"{group}-{choices[group]}" if group == "normals" else choices.get(group) for group in NAMED_CHOICES
-    ]
-    return "_".join(part for part in parts if part)
-
-
 def register_resolvers() -> None:
-    """Makes `${run_name:}` and `${unique:}` known to the configs."""
-    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+    """Makes the names of folders and `${unique:}` known to the configs."""
+    for name in (run_name, sweep_name, cell_name):
+        OmegaConf.register_new_resolver(name.__name__, name, replace=True)
     # two runs that start in one second must not share a folder
     OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
 

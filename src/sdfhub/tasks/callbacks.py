@@ -22,7 +22,10 @@ TENSORBOARD_VERTICES = 60_000
 
 
 class TrainingRecord(L.Callback):
-    """Seconds, steps and the loss at both ends of a training, for `metrics.json`."""
+    """Seconds, steps and the loss at both ends of a training, for `metrics.json`.
+
+    What an interrupted training had gathered by its last checkpoint counts when it is continued.
+    """
 
     ENDS = 20
     """Steps averaged at either end."""
@@ -30,23 +33,39 @@ class TrainingRecord(L.Callback):
     def __init__(self):
         self._first: list[float] = []
         self._last: deque[float] = deque(maxlen=self.ENDS)
-        self._seconds = 0.0
+        self._seconds = 0.0  # of all processes before this one; then, once training ends, of all
+        self._started: float | None = None
+        self._trainer: L.Trainer | None = None
+        self.stepped = False  # by this process
 
     def on_train_start(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        self._started = time.perf_counter()
+        self._trainer, self._started = trainer, time.perf_counter()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
+        self.stepped = True
         loss = float(outputs["loss"])
         self._last.append(loss)
         if len(self._first) < self.ENDS:
             self._first.append(loss)
 
     def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        watching = sum(one.seconds for one in trainer.callbacks if isinstance(one, MeshShapes))
-        self._seconds = time.perf_counter() - self._started - watching
+        self._seconds, self._started = self._so_far(), None
+
+    def _so_far(self) -> float:
+        if self._started is None:
+            return self._seconds
+        watching = sum(one.seconds for one in self._trainer.callbacks if isinstance(one, MeshShapes))
+        return self._seconds + time.perf_counter() - self._started - watching
+
+    def state_dict(self) -> dict:
+        return {"seconds": self._so_far(), "first": list(self._first), "last": list(self._last)}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._seconds, self._first = float(state["seconds"]), [float(loss) for loss in state["first"]]
+        self._last.extend(float(loss) for loss in state["last"])
 
     def summary(self, model: AutoDecoder) -> dict:
-        """Plain numbers: seconds without `MeshShapes`, steps of the whole run, parameters, loss."""
+        """Plain numbers: seconds without `MeshShapes` and steps of the whole run, parameters, loss."""
         mean = {"start": np.mean(self._first), "end": np.mean(self._last)} if self._last else {}
         return {
             "seconds": self._seconds,

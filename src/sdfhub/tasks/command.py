@@ -7,6 +7,7 @@ TASKS = {
     "train": "learns a shape space: sdfhub train activation=hosc encoding=fourier",
     "prepare": "makes samples ahead of time: sdfhub prepare data=open category=chairs",
     "evaluate": "judges a finished run again: sdfhub evaluate run=RUN evaluate.resolution=512",
+    "report": "tables, claims and a page from a sweep's folder: sdfhub report outputs/sweeps/table_small",
 }
 
 

@@ -59,11 +59,11 @@ def write_scores(
         rows = [row for row in judged if row.role == role]
         shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
         result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
-    write_text(out / "metrics.json", json.dumps(result, indent=1))
     write_text(out / "metrics.csv", _csv(judged))
     for row in judged:
         _write_mesh(row, out / "meshes" / row.role / f"{row.shape.id}.ply")
     _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
+    write_text(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print(table(judged))
     print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
     _print_places(out, trained=training is not None)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -18,8 +19,10 @@ from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.callbacks import LossBar, TrainingRecord
+from sdfhub.tasks.cells import run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
+from sdfhub.tasks.names import flat
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
 
@@ -65,7 +68,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     if not trainer.is_global_zero:
         return {}
     training = parts.record.summary(model)
-    if not training["loss"]:
+    if not parts.record.stepped:
         print(f"nothing was left to train in {parts.resume_from}: raise trainer.max_epochs to go on")
     known = dict(enumerate(prepared.train))
     metrics = evaluate_model(model, known, prepared.held_out, parts.evaluation, run, training)
@@ -151,14 +154,6 @@ def refuse_missing_normals(data: dict[str, Any]) -> None:
         raise SdfhubError(f"normals=on: the files of data={source.name} carry none; train with normals=off")
 
 
-def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by dotted key; a list counts as one setting."""
-    found: dict[str, Any] = {}
-    for key, value in node.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return found
-
-
 def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
     """Mean and median CD and shapes without a surface by role, for TensorBoard's table of runs."""
     scores = {}
@@ -190,6 +185,12 @@ def main() -> None:
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
-        train(plain(config), Path(HydraConfig.get().runtime.output_dir))
+        hydra = HydraConfig.get()
+        if hydra.mode == RunMode.MULTIRUN:
+            run_cell(train, config, hydra)
+        elif name := hydra.runtime.choices.get("sweeps"):
+            raise SdfhubError(f"sweeps={name}: is a table of runs; add -m")
+        else:
+            train(plain(config), Path(hydra.runtime.output_dir))
 
     run_task(task, "config")

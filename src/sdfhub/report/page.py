@@ -1,0 +1,135 @@
+"""The report as one HTML page that opens offline: text is escaped, and its policy lets no request out."""
+
+import base64
+import hashlib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from sdfhub.report.charts import Series, line_chart, strip_chart
+from sdfhub.report.claims import Verdict, verdicts
+from sdfhub.report.curves import curve
+from sdfhub.report.meshes import FindTruth
+from sdfhub.report.pictures import Gallery, Sheet
+from sdfhub.report.results import Cell
+from sdfhub.report.rows import Group, Row
+from sdfhub.report.tables import Table, tables
+
+COLOURS = 8
+
+MESH_BYTES, TO_TURN = 4_000_000, 4
+"""Room for meshes on a page, and shapes to turn for each group."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the page says about a group of comparable rows."""
+
+    title: str
+    tables: list[Table]
+    missing: list[list[str]]
+    verdicts: list[Verdict]
+    charts: list[tuple[str, Markup]]
+    legend: list[tuple[str, int, bool]]
+    sheet: Sheet
+    extremes: Sheet
+    meshes: int | None
+
+
+def page(name: str, cells: list[Cell], groups: list[Group], find_truth: FindTruth, shapes: int) -> str:
+    """The whole page as text.
+
+    Args:
+        name: of the sweep.
+        cells: all of them.
+        groups: their rows.
+        find_truth: prepared shapes by id.
+        shapes: on a contact sheet.
+    """
+    gallery, meshes, parts = Gallery(find_truth), [], []
+    for group in groups:
+        turning = gallery.turning(group, min(shapes, TO_TURN), MESH_BYTES // len(groups))
+        parts.append(_part(group, gallery, shapes, len(meshes) if turning else None))
+        meshes += [turning] if turning else []
+    script = _text("viewer.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return _template().render(
+        name=name,
+        counts=_counts(cells),
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        version=_version(),
+        parts=parts,
+        meshes=meshes,
+        style=Markup(_text("page.css")),
+        script=Markup(script),
+        script_hash=Markup(f"sha256-{digest}"),
+    )
+
+
+def _part(group: Group, gallery: Gallery, shapes: int, meshes: int | None) -> Part:
+    colours = {method: k % COLOURS for k, method in enumerate(dict.fromkeys(r.method for r in group.rows))}
+    found = tables(group)
+    return Part(
+        title=group.title,
+        tables=found,
+        missing=[row for table in found if table.head[0] == "cell" for row in table.rows],
+        verdicts=verdicts(group),
+        charts=_charts(group, colours),
+        legend=[(row.label, colours[row.method], row.normals != "on") for row in group.rows if row.done],
+        sheet=gallery.sheet(group, shapes),
+        extremes=gallery.extremes(group),
+        meshes=meshes,
+    )
+
+
+def _charts(group: Group, colours: dict[str, int]) -> list[tuple[str, Markup]]:
+    def series(row: Row, values: list) -> Series:
+        return Series(row.label, colours[row.method], row.normals != "on", values)
+
+    curves = [series(row, curve(cell.folder)) for row in group.rows for cell in row.done]
+    found = [
+        ("Loss of signed distances while training, a line a seed", line_chart(curves, "step", "clamped L1"))
+    ]
+    for role, words in (("known", "known"), ("held_out", "held-out")):
+        rows = [series(row, _distances(row, role)) for row in group.rows if row.done]
+        floors = [e.mean * 1e3 for row in group.rows if (e := row.estimate("floor_mean", role))]
+        marks = [(sum(floors) / len(floors), "noise floor")] if floors else []
+        chart = strip_chart(rows, "CD times 10³", marks)
+        found.append((f"CD of each {words} shape, all seeds; the bar is the median", chart))
+    return [(caption, chart) for caption, chart in found if chart]
+
+
+def _distances(row: Row, role: str) -> list[tuple[float, str]]:
+    return [
+        (shape.counted_cd * 1e3, f"{shape.id}, seed {cell.plan.seed}{', no surface' * shape.failed}")
+        for cell in row.done
+        for shape in cell.scores.shapes.get(role, [])
+    ]
+
+
+def _counts(cells: list[Cell]) -> str:
+    states = [cell.state for cell in cells]
+    told = [f"{states.count(state)} {state}" for state in ("failed", "missing") if state in states]
+    return ", ".join([f"{states.count('done')} of {len(cells)} cells done", *told])
+
+
+def _template():
+    environment = Environment(
+        loader=PackageLoader("sdfhub.report", "."), autoescape=True, undefined=StrictUndefined
+    )
+    return environment.get_template("page.html.j2")
+
+
+def _text(name: str) -> str:
+    return files("sdfhub.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _version() -> str:
+    try:
+        return version("sdfhub")
+    except PackageNotFoundError:  # run from a folder without an installation
+        return "(not installed)"

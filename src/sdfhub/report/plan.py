@@ -1,0 +1,117 @@
+"""What a sweep consists of: `sweep.json` in its folder lists the cells, finished or not. Plain data.
+
+A cell is one training. Its folder is named after all its settings, so cells of another scale, category or
+seed lie side by side, and a cell whose settings have changed since is superseded, not overwritten.
+"""
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+
+from sdfhub.data.shards import write_whole
+from sdfhub.errors import SdfhubError
+
+PLAN, FAILURE = "sweep.json", "failed.json"
+
+Text = Annotated[str, StringConstraints(max_length=2000)]
+
+
+class PlannedCell(BaseModel):
+    """One cell as its command line described it.
+
+    Args:
+        folder: name of its folder below the sweep's.
+        choices: option by config group, `sweeps` among them.
+        settings: values set beside the groups and the seed, by dotted key.
+        seed: of the training.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    folder: Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_length=255)]
+    choices: dict[Text, Text]
+    settings: dict[Text, Text]
+    seed: int
+
+    @property
+    def identity(self) -> tuple:
+        """What the command line said: two cells that agree in it are one, under old and new defaults."""
+        return tuple(sorted(self.choices.items())), tuple(sorted(self.settings.items())), self.seed
+
+
+class Plan(BaseModel):
+    """The content of `sweep.json`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: Literal[1] = 1
+    cells: list[PlannedCell] = []
+
+
+def read_plan(sweep: Path) -> list[PlannedCell]:
+    """The cells of a sweep's folder, in the order of their commands.
+
+    Raises:
+        SdfhubError: it is not a sweep's folder, or `sweep.json` is broken.
+    """
+    try:
+        return Plan.model_validate_json((sweep / PLAN).read_bytes()).cells
+    except OSError as error:
+        raise SdfhubError(
+            f"{sweep}: not a sweep's folder ({PLAN}: {(error.strerror or 'unreadable').lower()})"
+        ) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "content"
+        raise SdfhubError(f"{sweep / PLAN}: {place}: {first['msg'].lower()}") from error
+
+
+def enter_cells(sweep: Path, cells: Iterable[PlannedCell]) -> None:
+    """Adds cells to `sweep.json`; replaces those whose settings have changed. Safe side by side."""
+    sweep.mkdir(parents=True, exist_ok=True)
+    with locked(sweep / ".lock"):
+        known = {cell.identity: cell for cell in (read_plan(sweep) if (sweep / PLAN).exists() else ())}
+        known |= {cell.identity: cell for cell in cells}
+        by_folder = {cell.folder: cell for cell in known.values()}  # seed=0 said or left out is one cell
+        plan = Plan(cells=list(by_folder.values()))
+        write_whole(sweep / PLAN, json.dumps(plan.model_dump(), indent=1).encode())
+
+
+@contextmanager
+def locked(path: Path, patience: float = float("inf")) -> Iterator[bool]:
+    """Holds a lock file; gives False where another process still holds it after `patience` seconds.
+
+    The system releases it when the process ends, however it ends. Where locks do not work (some network
+    disks, Windows), every process gets it.
+    """
+    limit = time.monotonic() + patience
+    with path.open("w") as file:
+        while not (ours := _lock(file)) and time.monotonic() < limit:
+            time.sleep(0.1)
+        yield ours
+
+
+def _lock(file) -> bool:
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        pass
+    return True
+
+
+def is_locked(path: Path) -> bool:
+    """Whether another process holds the lock file now."""
+    if not path.exists() or not os.access(path, os.W_OK):
+        return False
+    with locked(path, patience=0) as free:
+        return not free

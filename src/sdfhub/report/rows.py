@@ -1,0 +1,189 @@
+"""Cells become rows: one row a method, its seeds together; one group a table's worth of settings."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from sdfhub.report.results import Cell
+
+PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
+"""The paper's names of encodings, and ours for those that it does not name."""
+
+ORDER = ("DeepSDF", "SIREN", "FFT/SIREN", "FFT/HOSC", "HASH/SIREN", "HASH/HOSC")
+"""Rows of the paper's tables first, in its order."""
+
+OF_THE_GROUP = ("sweeps", "data", "category", "scale", "evaluate")
+"""Choices under which numbers may be compared: rows that differ in one stand in different tables."""
+
+THOUSANDFOLD = ("cd_mean", "cd_median", "excess_mean", "excess_median")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds and the half width of its 95% confidence interval (Student's t).
+
+    Args:
+        mean: of the seeds' values.
+        half_width: None for a single seed, which says nothing about others.
+        seeds: how many.
+    """
+
+    mean: float
+    half_width: float | None
+    seeds: int
+
+
+def estimate(values: list[float]) -> Estimate:
+    """The mean of independent values with its confidence interval.
+
+    Args:
+        values: one per seed, at least one.
+    """
+    n = len(values)
+    if n < 2:
+        return Estimate(float(values[0]), None, n)
+    half = stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n)
+    return Estimate(float(np.mean(values)), float(half), n)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method in a group of comparable cells.
+
+    Args:
+        method: as the paper writes it: `FFT/SIREN`.
+        normals: `on` or `off`.
+        detail: what else tells the row from others of its method; mostly empty.
+        cells: one a seed.
+    """
+
+    method: str
+    normals: str
+    detail: str
+    cells: list[Cell]
+
+    @property
+    def label(self) -> str:
+        """Method, normals where they are no matter of course, and detail, in one line."""
+        plain = self.method == "DeepSDF" and self.normals == "off"
+        words = "" if plain else {"on": " + normals", "off": ", no normals"}.get(self.normals, "")
+        return f"{self.method}{words}{f' ({self.detail})' if self.detail else ''}"
+
+    @property
+    def done(self) -> list[Cell]:
+        return [cell for cell in self.cells if cell.scores]
+
+    def estimate(self, quantity: str, role: str = "known") -> Estimate | None:
+        """A quantity over the finished seeds; None where no seed has it.
+
+        Args:
+            quantity: `cd_mean`, `cd_median`, `excess_mean`, `excess_median` (normalised units squared, shapes
+                without a surface counted with their penalty), `floor_mean`, `no_surface` (shapes), `seconds`,
+                `parameters`, `steps`, `epochs`, `samples` or `trained_on`.
+            role: `known` or `held_out`; costs do not depend on it.
+        """
+        values = [_value(cell, quantity, role) for cell in self.done]
+        kept = [value for value in values if value is not None]
+        return estimate(kept) if kept else None
+
+
+def _value(cell: Cell, quantity: str, role: str) -> float | None:
+    scores = cell.scores
+    if quantity in ("seconds", "parameters", "steps"):
+        return getattr(scores.training, quantity)
+    if quantity in ("epochs", "samples", "trained_on"):
+        return getattr(scores, quantity)
+    shapes = scores.shapes.get(role)
+    if not shapes:
+        return None
+    if quantity == "no_surface":
+        return sum(shape.failed for shape in shapes)
+    what, statistic = quantity.rsplit("_", 1)
+    field = {"cd": "counted_cd", "excess": "excess", "floor": "floor"}[what]
+    values = [getattr(shape, field) for shape in shapes]
+    return float({"mean": np.mean, "median": np.median}[statistic](values))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows that may be compared: the same sweep, data, category, scale and way of judging.
+
+    Args:
+        choices: what they share of OF_THE_GROUP.
+        settings: values on the command line that all of them share.
+        rows: in the order of the paper, then of the command.
+    """
+
+    choices: dict[str, str]
+    settings: dict[str, str]
+    rows: list[Row]
+
+    @cached_property
+    def title(self) -> str:
+        """`chairs, data=open, scale=cpu, 20 shapes`."""
+        shapes = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
+        counted = (
+            [f"{' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))} shapes"] if shapes else []
+        )
+        named = [f"{name}={self.choices[name]}" for name in ("data", "scale") if name in self.choices]
+        said = [f"{key}={value}" for key, value in self.settings.items()]
+        return ", ".join([self.choices.get("category", "all"), *named, *counted, *said])
+
+    def row(self, method: str, normals: str) -> Row | None:
+        """The row of that method without further detail, if it is there."""
+        of_method = [row for row in self.rows if (row.method, row.normals) == (method, normals)]
+        return of_method[0] if len(of_method) == 1 else None
+
+    @property
+    def deepsdf(self) -> Row | None:
+        """The rival all others are measured by: DeepSDF as published."""
+        return self.row("DeepSDF", "off")
+
+
+def group_cells(cells: list[Cell]) -> list[Group]:
+    """The cells of a sweep as groups of rows."""
+    by_group: dict[tuple, list[Cell]] = {}
+    for cell in cells:
+        by_group.setdefault(tuple(cell.plan.choices.get(name) for name in OF_THE_GROUP), []).append(cell)
+    return [_group(members) for members in by_group.values()]
+
+
+def _group(cells: list[Cell]) -> Group:
+    common = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
+    by_row: dict[tuple, list[Cell]] = {}
+    for cell in cells:
+        own = tuple(sorted(set(cell.plan.settings.items()) - common))
+        others = tuple(sorted(pair for pair in cell.plan.choices.items() if pair[0] not in OF_THE_GROUP))
+        by_row.setdefault((own, others), []).append(cell)
+    names = {key: (_method(dict(key[1])), dict(key[1]).get("normals", "?")) for key in by_row}
+    rows = [
+        Row(*names[key], _detail(key, [k for k in by_row if names[k] == names[key]]), members)
+        for key, members in by_row.items()
+    ]
+    rows.sort(key=lambda row: (_rank(row.method), row.normals != "on"))
+    first = cells[0].plan.choices
+    return Group({name: first[name] for name in OF_THE_GROUP if name in first}, dict(sorted(common)), rows)
+
+
+def _method(choices: dict[str, str]) -> str:
+    if choices.get("decoder") == "deepsdf" and choices.get("activation") == "relu":
+        return "DeepSDF" if choices.get("encoding") == "none" else f"{_encoding(choices)}DeepSDF"
+    return f"{_encoding(choices)}{choices.get('activation', '?').upper()}"
+
+
+def _encoding(choices: dict[str, str]) -> str:
+    encoding = choices.get("encoding", "none")
+    return PREFIXES.get(encoding, f"{encoding.upper()}/")
+
+
+def _rank(method: str) -> int:
+    return ORDER.index(method) if method in ORDER else len(ORDER)
+
+
+def _detail(key: tuple, namesakes: list[tuple]) -> str:
+    """Settings of the row's own, and choices only where rows of its name differ in them."""
+    own, others = key
+    common = set.intersection(*(set(k[1]) for k in namesakes))
+    return ", ".join(f"{name}={value}" for name, value in [*own, *(p for p in others if p not in common)])

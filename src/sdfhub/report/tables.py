@@ -1,0 +1,174 @@
+"""Groups of rows as tables of text: scores, the paper's figures beside them, costs, claims."""
+
+from dataclasses import dataclass
+
+from sdfhub.report.claims import verdicts
+from sdfhub.report.paper import COSTS, PRINTED
+from sdfhub.report.results import ROLES
+from sdfhub.report.rows import Estimate, Group, Row
+
+NONE = "–"
+"""An empty cell of a table."""
+
+QUANTITIES = ("cd_mean", "cd_median", "floor_mean", "excess_mean", "excess_median")
+"""Columns of a table of scores."""
+
+TITLES = {"known": "Known shapes", "held_out": "Held-out shapes"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text.
+
+    Args:
+        title: what it shows.
+        head: a heading per column; the first column names the row.
+        rows: a text per column.
+        notes: lines below it.
+        best: row and column of the cells that are the best of their column.
+    """
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    notes: list[str]
+    best: frozenset[tuple[int, int]] = frozenset()
+
+
+def tables(group: Group) -> list[Table]:
+    """The tables of a group: scores by role, known ones beside the paper, costs, and what is missing."""
+    roles = [role for role in ROLES if any(row.estimate("cd_mean", role) for row in group.rows)]
+    found = [_scores(group, role) for role in roles]
+    beside = [_beside_paper(group)] if "known" in roles else []
+    return [*found[:1], *beside, *found[1:], _costs(group), *_missing(group)]
+
+
+def _scores(group: Group, role: str) -> Table:
+    head = ["method", "CD mean", "CD median", "floor", "excess mean", "excess median", "no surface", "seeds"]
+    rivals = ["excess mean / DeepSDF", "excess median / DeepSDF"] if group.deepsdf else []
+    rows = []
+    for row in group.rows:
+        cells = [_thousandth(row.estimate(quantity, role)) for quantity in QUANTITIES]
+        cells += [_no_surface(row, role), _seeds(row)]
+        cells += [_ratio(group, row, q, role) for q in ("excess_mean", "excess_median") if rivals]
+        rows.append([row.label, *cells])
+    notes = [
+        "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
+        "samplings of the truth. Shapes without a surface count with the CD of a single point. "
+        "± is a 95% confidence interval over seeds (Student's t)."
+    ]
+    title = f"{TITLES[role]}: {group.title}"
+    return Table(title, [*head, *rivals], rows, notes, _best(group, role))
+
+
+def _beside_paper(group: Group) -> Table:
+    """CD of known shapes and its ratio to DeepSDF's, ours and what the paper prints."""
+    is_large = group.choices.get("sweeps") == "table_large"
+    printed = PRINTED["table_large" if is_large else "table_small"]
+    rows = []
+    for row in group.rows:
+        cells = []
+        for quantity in ("cd_mean", "cd_median"):
+            figures = {} if row.detail else printed.get((row.method, row.normals), {})
+            value, rival = figures.get(quantity), printed["DeepSDF", "off"][quantity]
+            cells += [_thousandth(row.estimate(quantity)), f"{value * 1e3:.4f}" if value else NONE]
+            cells += [_ratio(group, row, quantity), f"{value / rival:.3g}" if value else NONE]
+        rows.append([row.label, *cells])
+    head = [
+        f"CD {statistic}{end}"
+        for statistic in ("mean", "median")
+        for end in ("", ", paper", " / DeepSDF", " / DeepSDF, paper")
+    ]
+    notes = [f"The paper's columns are its Table {3 if is_large else 2}, from other data: compare ratios."]
+    return Table(f"Beside the paper: {group.title}", ["method", *head], rows, notes)
+
+
+def _ratio(group: Group, row: Row, quantity: str, role: str = "known") -> str:
+    """The row's value over DeepSDF's; none where that says nothing (an excess at or below 0)."""
+    rival = group.deepsdf.estimate(quantity, role) if group.deepsdf else None
+    own = row.estimate(quantity, role)
+    return f"{own.mean / rival.mean:.3g}" if own and rival and rival.mean > 0 else NONE
+
+
+def _best(group: Group, role: str) -> frozenset[tuple[int, int]]:
+    """Row and column of the lowest value of each quantity but the floor, which is no row's merit."""
+    found = set()
+    for column, quantity in enumerate(QUANTITIES, start=1):
+        values = {k: e.mean for k, row in enumerate(group.rows) if (e := row.estimate(quantity, role))}
+        if len(values) > 1 and quantity != "floor_mean":
+            found.add((min(values, key=values.get), column))
+    return frozenset(found)
+
+
+def _costs(group: Group) -> Table:
+    head = ["method", "shapes", "parameters", "epochs", "steps", "samples", "training time"]
+    head += ["time / DeepSDF", "paper: parameters", "paper: training time", "paper: time / DeepSDF"]
+    rows = []
+    for row in group.rows:
+        counts = [
+            _count(row.estimate(key)) for key in ("trained_on", "parameters", "epochs", "steps", "samples")
+        ]
+        seconds = row.estimate("seconds")
+        paper = COSTS.get((row.method, row.normals)) if not row.detail else None
+        printed = [NONE] * 3
+        if paper:
+            share = paper["seconds"] / COSTS["DeepSDF", "off"]["seconds"]
+            printed = [f"{paper['parameters']:,.0f}", f"{paper['seconds'] / 3600:.0f} h", f"{share:.3g}"]
+        time = NONE if seconds is None else duration(seconds.mean)
+        rows.append([row.label, *counts, time, _ratio(group, row, "seconds"), *printed])
+    notes = [
+        "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+    ]
+    return Table(f"Cost: {group.title}", head, rows, notes)
+
+
+def _missing(group: Group) -> list[Table]:
+    """The cells without scores, each with its reason; no table where there are none."""
+    lines = [
+        [f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason]
+        for row in group.rows
+        for cell in row.cells
+        if cell.state != "done"
+    ]
+    return [Table(f"Not there: {group.title}", ["cell", "state", "reason"], lines, [])] if lines else []
+
+
+def claims_table(group: Group) -> Table:
+    """Every claim of the paper with its verdict and the figures behind it."""
+    rows = [
+        [one.claim.text, one.claim.source, one.told, "; ".join([*one.figures, one.claim.note]).strip("; ")]
+        for one in verdicts(group)
+    ]
+    return Table(f"Claims of the paper: {group.title}", ["claim", "source", "verdict", "figures"], rows, [])
+
+
+def duration(seconds: float) -> str:
+    """`4.8 s`, `48 s`, `12.5 min`, `30.2 h`."""
+    if seconds < 120:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def _thousandth(value: Estimate | None) -> str:
+    """A Chamfer distance times 10^3, four digits below 10 and fewer above, with its interval."""
+    if value is None:
+        return NONE
+    mean, half = value.mean * 1e3, (value.half_width or 0) * 1e3
+    places = 4 if abs(mean) < 10 else 2
+    return f"{mean:.{places}f}" + (f" ± {half:.{places}f}" if half else "")
+
+
+def _count(value: Estimate | None) -> str:
+    return NONE if value is None else f"{value.mean:,.0f}"
+
+
+def _no_surface(row: Row, role: str) -> str:
+    shapes = [cell.scores.shapes.get(role, []) for cell in row.done]
+    return f"{sum(s.failed for one in shapes for s in one)}/{sum(map(len, shapes))}" if row.done else NONE
+
+
+def _seeds(row: Row) -> str:
+    states = {cell.state for cell in row.cells}
+    if not row.done:
+        return "failed" if "failed" in states else "missing"
+    return f"{len(row.done)}/{len(row.cells)}"

@@ -1,0 +1,101 @@
+"""One cell of a sweep: trained once, continued where it was interrupted, and its failure written down."""
+
+import json
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig
+
+from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, locked
+from sdfhub.tasks.app import one_line
+from sdfhub.tasks.build import plain
+from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
+from sdfhub.tasks.run import write_text
+
+UNTOLD_GROUPS = ("callbacks", "trainer", "logger")
+"""Groups that say where and how watched a cell runs."""
+
+
+def run_cell(
+    train: Callable[[dict[str, Any], Path], dict[str, Any]], config: DictConfig, hydra: DictConfig
+) -> dict[str, Any]:
+    """Trains a cell of a sweep unless it is finished or another process has it in hand.
+
+    A cell that was interrupted goes on from its last checkpoint. One that fails leaves `failed.json` with the
+    reason and a line on stderr, and raises nothing: the other cells go on, under any launcher.
+
+    Args:
+        train: trains what a plain config describes into a folder and returns its metrics.
+        config: composed, without Hydra's own part.
+        hydra: Hydra's own part.
+
+    Returns:
+        What `metrics.json` holds; empty for a cell that failed or that another process trains.
+    """
+    folder = Path(hydra.runtime.output_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
+    with locked(folder / ".lock", patience=1) as ours:  # a report holds it for a moment, a training for hours
+        if not ours:
+            print(f"cell: {folder}: another process is training it", flush=True)
+            return {}
+        try:
+            return _trained(train, plain(config), folder)
+        except Exception as error:
+            _write_failure(folder, error)
+            return {}
+
+
+def _trained(train: Callable, config: dict[str, Any], folder: Path) -> dict[str, Any]:
+    metrics = finished(folder, config)
+    if metrics is not None:
+        print(f"cell: {folder}: finished before", flush=True)
+        return metrics
+    (folder / FAILURE).unlink(missing_ok=True)
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    alone = config["trainer"].get("strategy") is None  # the processes of ddp read the config, not this
+    if config["ckpt_path"] is None and checkpoint.is_file() and alone:
+        print(f"cell: {folder}: goes on from {checkpoint.name}", flush=True)
+        config["ckpt_path"] = str(checkpoint)
+    return train(config, folder)
+
+
+def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
+    """The metrics of a cell that was trained and judged under these very settings; None where it was not."""
+    try:
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        then = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+        same = settings_digest(then) == settings_digest(config)
+    except (OSError, ValueError, yaml.YAMLError, AttributeError):
+        return None
+    return metrics if same and isinstance(metrics, dict) else None
+
+
+def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
+    """A composed cell as `sweep.json` keeps it."""
+    groups = {name: choice for name, choice in hydra.runtime.choices.items() if "/" not in name}
+    said = (override.lstrip("+~").partition("=") for override in hydra.overrides.task)
+    return PlannedCell(
+        folder=folder,
+        choices={
+            name: str(choice) for name, choice in groups.items() if choice and name not in UNTOLD_GROUPS
+        },
+        settings={
+            key: value
+            for key, _, value in said
+            if key not in groups and key != "seed" and not key.startswith(WHERE_NOT_WHAT)
+        },
+        seed=int(config.seed),
+    )
+
+
+def _write_failure(folder: Path, error: Exception) -> None:
+    told = one_line(error)
+    reason = told if str(error) else type(error).__name__
+    trace = "".join(traceback.format_exception(error))
+    write_text(folder / FAILURE, json.dumps({"reason": reason, "traceback": trace}, indent=1))
+    print(f"sdfhub: error: {folder.name}: {reason}", file=sys.stderr, flush=True)

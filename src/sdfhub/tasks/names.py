@@ -1,0 +1,60 @@
+"""Names of folders: of a run, of a sweep, and of a sweep's cell, which are found again by name."""
+
+import hashlib
+import json
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
+
+WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
+WHERE_NOT_WHAT += ("data.loader.workers", "trainer.enable_", "trainer.log_every_n_steps")
+WHERE_NOT_WHAT += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
+"""Settings that say where and how watched a cell runs; its result is the same under any of them."""
+
+
+def run_name() -> str:
+    """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
+    return _joined(HydraConfig.get().runtime.choices)
+
+
+def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
+    """Folder name of a multirun: the sweep's own name, so that the same command finds its cells again."""
+    return _root_.hydra.runtime.choices.get("sweeps") or otherwise
+
+
+def cell_name(*, _root_: DictConfig) -> str:
+    """Folder name of a cell: its choices, its seed, and a digest of all its settings."""
+    settings = OmegaConf.masked_copy(_root_, [key for key in _root_ if key != "hydra"])
+    try:
+        digest = settings_digest(OmegaConf.to_container(settings, resolve=True))
+    except Exception:  # a broken interpolation is that cell's own failure, to be told when it runs
+        digest = settings_digest({"overrides": list(_root_.hydra.overrides.task)})
+    return f"{_joined(_root_.hydra.runtime.choices)}_seed-{_root_.seed}_{digest}"
+
+
+def settings_digest(config: dict[str, Any]) -> str:
+    """10 hex digits that change with every setting that can change a run's result.
+
+    Args:
+        config: plain, as `config.yaml` of a run holds it.
+    """
+    kept = {key: value for key, value in flat(config).items() if not key.startswith(WHERE_NOT_WHAT)}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:10]
+
+
+def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by dotted key; a list counts as one setting."""
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
+def _joined(choices: Any) -> str:
+    parts = [
+        f"{group}-{choices[group]}" if group == "normals" else choices.get(group) for group in NAMED_CHOICES
+    ]
+    return "_".join(part for part in parts if part)

@@ -1,0 +1,97 @@
+"""Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
+
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from sdfhub.data.shards import StoredShape
+from sdfhub.data.store import Store, preparation_hash
+from sdfhub.errors import SdfhubError
+from sdfhub.report.formats import csv_text, latex, markdown
+from sdfhub.report.meshes import FindTruth
+from sdfhub.report.page import page
+from sdfhub.report.results import read_sweep
+from sdfhub.report.rows import Group, group_cells
+from sdfhub.report.tables import claims_table, tables
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.run import write_text
+
+
+def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
+    """Writes `table.md`, `table.tex`, `table.csv` and `report.html`, and prints the tables.
+
+    Args:
+        sweep: folder of a multirun, finished or not.
+        out: folder of the report.
+        shapes: pictured side by side.
+
+    Raises:
+        SdfhubError: not a sweep's folder.
+    """
+    cells = read_sweep(sweep)
+    groups = group_cells(cells)
+    all_tables = [table for group in groups for table in tables(group)]
+    print("\n" + markdown(all_tables))
+    claims = [claims_table(group) for group in groups]
+    write_text(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims])}")
+    write_text(out / "table.tex", latex(all_tables))
+    write_text(out / "table.csv", csv_text(groups))
+    write_text(out / "report.html", page(sweep.name, cells, groups, truth_finder(groups), shapes))
+    print(f"report: {out / 'report.html'}", flush=True)
+
+
+def truth_finder(groups: list[Group]) -> FindTruth:
+    """Finds prepared shapes in the stores that the cells were trained from, as far as they are here."""
+    configs = [cell.scores.config for group in groups for row in group.rows for cell in row.done]
+    stores = {id(config): _store(config) for config in _one_per_store(configs)}
+
+    @cache
+    def find(id: str) -> StoredShape | None:
+        return next((store[id] for store in stores.values() if store and id in store), None)
+
+    return find
+
+
+def _one_per_store(configs: list[dict]) -> list[dict]:
+    keys = ("source", "preparation", "store")
+    return list({str([config["data"].get(key) for key in keys]): config for config in configs}.values())
+
+
+def _store(config: dict[str, Any]) -> Store | None:
+    try:
+        data = config["data"]
+        source = build(data["source"], "data.source", within="sdfhub.data.sources")
+        preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
+        store = Store.open(Path(data["store"]) / source.name / preparation_hash(preparation))
+    except (SdfhubError, KeyError, TypeError, AttributeError):
+        return None  # not on this machine: a report without ground truth
+    for shape in store:
+        shape.up = source.up
+    return store
+
+
+def report(config: dict[str, Any]) -> None:
+    """The task: `config` as conf/report.yaml has it."""
+    sweep = Path(check(config["sweep"], str, "sweep"))
+    out = check(config["out"], str | None, "out")
+    shapes = check(config["shapes"], int, "shapes")
+    if shapes < 1:
+        raise SdfhubError(f"shapes={shapes}: must be at least 1")
+    write_report(sweep, Path(out) if out else sweep / "report", shapes)
+
+
+def main() -> None:
+    """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
+    first = sys.argv[1] if len(sys.argv) > 1 else "-"
+    if Path(first).is_dir() or (not first.startswith("-") and "=" not in first):
+        quoted = first.replace("\\", "\\\\").replace("'", "\\'")
+        sys.argv[1] = f"sweep='{quoted}'"  # quoted, so that Hydra takes any path as text
+
+    def task(config: DictConfig) -> None:
+        report(plain(config))
+
+    run_task(task, "report")

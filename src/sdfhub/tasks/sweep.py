@@ -1,0 +1,84 @@
+"""A multirun from its first cell to its report: what is planned, what came of it, the exit status."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from sdfhub.errors import SdfhubError
+from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
+from sdfhub.tasks.cells import planned_cell
+from sdfhub.tasks.report import write_report
+
+
+class SweepRecord(Callback):
+    """Writes `sweep.json` before the first cell and the report after the last one.
+
+    The process ends with status 1 where a cell of this command failed.
+    """
+
+    def __init__(self) -> None:
+        self._planned: list[PlannedCell] = []
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        if not _is_training(config):
+            return
+        try:
+            self._planned = planned_cells(config)
+        except Exception as error:  # the sweeper composes the same, and tells it better
+            print(f"sdfhub: the sweep cannot be planned: {error}", file=sys.stderr)
+            return
+        enter_cells(Path(config.hydra.sweep.dir), self._planned)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        if not _is_training(config):
+            return
+        sweep = Path(config.hydra.sweep.dir)
+        try:
+            write_report(sweep, sweep / "report")
+        except SdfhubError as error:
+            print(f"sdfhub: error: {error}", file=sys.stderr)
+        cells = self._planned or read_plan(sweep)
+        failed = [cell for cell in cells if (sweep / cell.folder / FAILURE).exists()]
+        if failed:
+            print(f"sdfhub: error: {len(failed)} of {len(cells)} cells failed", file=sys.stderr)
+            sys.exit(1)
+
+
+def planned_cells(config: DictConfig) -> list[PlannedCell]:
+    """The cells that a multirun's command line stands for; [] under a sweeper that decides as it goes.
+
+    Args:
+        config: of the multirun, Hydra's own part included.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    return [as_planned(loader.load_sweep_config(config, job)) for job in jobs(config)]
+
+
+def jobs(config: DictConfig) -> list[list[str]]:
+    """The overrides of each cell, as Hydra's own sweeper makes them."""
+    if not str(config.hydra.sweeper._target_).endswith(".BasicSweeper"):
+        return []
+    params = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
+    words = [f"{key}={value}" for key, value in params.items()] + list(config.hydra.overrides.task)
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    (batch,) = BasicSweeper.split_arguments(parser.parse_overrides(words), max_batch_size=None)
+    return batch
+
+
+def as_planned(config: DictConfig) -> PlannedCell:
+    """A composed cell as `sweep.json` keeps it; Hydra's own part leaves the config."""
+    with open_dict(config):
+        folder = str(config.hydra.sweep.subdir)
+        hydra = config.pop("hydra")
+    return planned_cell(config, hydra, folder)
+
+
+def _is_training(config: DictConfig) -> bool:
+    """Preparation shares the training's config, but makes no cells."""
+    return config.hydra.job.config_name == "config"

@@ -1,0 +1,332 @@
+"""A sweep's report: numbers equal those made by hand, what is not there is said, and nothing is injected."""
+
+import csv
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sdfhub.errors import SdfhubError
+from sdfhub.report.claims import verdicts
+from sdfhub.report.formats import csv_text, latex, markdown
+from sdfhub.report.meshes import Mesh, reconstruction
+from sdfhub.report.page import page
+from sdfhub.report.paper import CLAIMS, COSTS, PRINTED
+from sdfhub.report.pictures import packed
+from sdfhub.report.plan import PLAN, enter_cells, locked, read_plan
+from sdfhub.report.results import read_sweep
+from sdfhub.report.rows import estimate, group_cells
+from sdfhub.report.tables import claims_table, tables
+from sdfhub.tasks import report as report_task
+from sdfhub.tasks.report import write_report
+from tests.sweep_folders import planned, score, write_cell, write_mesh
+
+
+def only_group(sweep):
+    (group,) = group_cells(read_sweep(sweep))
+    return group
+
+
+def no_truth(id):
+    return None
+
+
+@pytest.fixture
+def small(tmp_path):
+    """DeepSDF and FFT/SIREN, two seeds each, three known shapes and a held-out one."""
+    sweep = tmp_path / "table_small"
+    deepsdf = {"seconds": 300, "parameters": 4000}
+    write_cell(sweep, planned("DeepSDF", "off", 0), [0.2e-3, 0.4e-3, 0.6e-3], [0.9e-3], **deepsdf)
+    write_cell(sweep, planned("DeepSDF", "off", 1), [0.4e-3, 0.6e-3, 0.8e-3], [1.1e-3], **deepsdf)
+    write_cell(sweep, planned("FFT/SIREN", "on", 0), [0.1e-3, 0.1e-3, 0.4e-3], [0.3e-3])
+    write_cell(sweep, planned("FFT/SIREN", "on", 1), [0.2e-3, 0.2e-3, 0.2e-3], [0.5e-3])
+    return sweep
+
+
+def test_a_table_equals_what_is_computed_by_hand(small):
+    """Means over seeds: DeepSDF (.4 + .6) / 2, FFT/SIREN (.2 + .2) / 2; t(.975, 1) = 12.706."""
+    group = only_group(small)
+    known, beside, held_out, cost = tables(group)
+    half = 12.7062 * math.sqrt(0.02) / math.sqrt(2)
+    assert known.rows[0][:7] == [
+        "DeepSDF",
+        f"0.5000 ± {half:.4f}",
+        f"0.5000 ± {half:.4f}",
+        "0.0500",
+        f"0.4500 ± {half:.4f}",
+        f"0.4500 ± {half:.4f}",
+        "0/6",
+    ]
+    assert known.rows[1][0] == "FFT/SIREN + normals"
+    assert known.rows[1][1] == "0.2000", "both seeds have the same mean: no interval to print"
+    assert known.rows[1][2] == f"0.1500 ± {half / 2:.4f}"
+    assert known.rows[1][8:] == [f"{0.15 / 0.45:.3g}", f"{0.10 / 0.45:.3g}"], "excess over DeepSDF's"
+    assert known.best == {(1, 1), (1, 2), (1, 4), (1, 5)}
+    assert beside.rows[1][1:5] == ["0.2000", "0.1284", "0.4", f"{0.1284 / 0.2076:.3g}"]
+    assert beside.rows[1][7:] == ["0.3", f"{0.0508 / 0.0432:.3g}"]
+    assert held_out.rows[1][1].startswith("0.4000 ±")
+    samples = 50 * 3 * 256  # three shapes are fewer than the 20 of a step
+    assert cost.rows[1][1:8] == ["3", "1,000", "90", "50", f"{samples:,}", "100 s", f"{1 / 3:.3g}"]
+
+
+def test_the_csv_carries_the_same_numbers(small):
+    lines = list(csv.DictReader(csv_text([only_group(small)]).splitlines()))
+    row = next(line for line in lines if line["method"] == "FFT/SIREN" and line["role"] == "known")
+    assert float(row["cd_median"]) == pytest.approx(0.15e-3)
+    assert float(row["cd_median_ci95"]) == pytest.approx(
+        12.7062 * math.sqrt(0.005e-6) / math.sqrt(2), rel=1e-4
+    )
+    assert (row["cd_median_seeds"], row["cells"], row["parameters"]) == ("2", "2", "1000.0")
+
+
+def test_an_interval_is_students_and_one_seed_has_none():
+    three = estimate([1.0, 2.0, 3.0])
+    assert (three.mean, three.half_width) == (2.0, pytest.approx(4.302653 / math.sqrt(3)))
+    assert estimate([5.0]).half_width is None
+
+
+def test_a_shape_without_a_surface_counts_with_its_penalty_and_is_counted(tmp_path):
+    write_cell(tmp_path / "s", planned("SIREN"), [0.1e-3, None, 0.3e-3])
+    group = only_group(tmp_path / "s")
+    assert group.rows[0].estimate("cd_mean").mean == pytest.approx((0.1e-3 + 0.4 + 0.3e-3) / 3)
+    assert group.rows[0].estimate("excess_median").mean == pytest.approx(0.25e-3)
+    assert tables(group)[0].rows[0][6] == "1/3"
+
+
+def test_failed_missing_and_broken_cells_are_told_in_a_line_each(small):
+    failed = planned("SIREN", "on", 0)
+    broken = planned("SIREN", "on", 1)
+    enter_cells(small, [failed, planned("FFT/HOSC", "on", 0)])
+    (small / failed.folder).mkdir()
+    (small / failed.folder / "failed.json").write_text(json.dumps({"reason": "loss is not finite at step 7"}))
+    path = write_cell(small, broken, [0.1e-3]) / "metrics.json"
+    path.write_text(path.read_text()[:-40])
+    group = only_group(small)
+    *_, table = tables(group)
+    assert table.rows == [
+        ["SIREN + normals, seed 0", "failed", "loss is not finite at step 7"],
+        ["SIREN + normals, seed 1", "failed", "metrics.json: cannot be read (JSONDecodeError)"],
+        ["FFT/HOSC + normals, seed 0", "missing", "has not been run"],
+    ]
+    states = {row[0]: row[7] for row in tables(group)[0].rows}
+    assert (states["SIREN + normals"], states["FFT/HOSC + normals"]) == ("failed", "missing")
+    html = page("sweep", read_sweep(small), [group], no_truth, 2)
+    assert "loss is not finite at step 7" in html and "has not been run" in html
+
+
+WRONG = {
+    "cd is a word": ("cd", "small", "known.shapes.0.cd"),
+    "cd is not finite": ("cd", float("nan"), "finite"),
+    "floor is missing": ("floor", None, "known.shapes.0.floor"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_metrics_are_checked_before_they_enter_a_mean(case, tmp_path):
+    key, value, told = WRONG[case]
+    folder = write_cell(tmp_path / "s", planned("SIREN"), [0.1e-3])
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["known"]["shapes"][0][key] = value
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    (cell,) = read_sweep(tmp_path / "s")
+    assert cell.state == "failed" and told in cell.reason
+
+
+def test_a_config_that_would_run_code_is_not_run(tmp_path):
+    folder = write_cell(tmp_path / "s", planned("SIREN"), [0.1e-3])
+    (folder / "config.yaml").write_text(f"!!python/object/apply:os.mkdir ['{tmp_path / 'pwned'}']")
+    (cell,) = read_sweep(tmp_path / "s")
+    assert cell.state == "failed" and "config.yaml" in cell.reason
+    assert not (tmp_path / "pwned").exists()
+
+
+@pytest.mark.parametrize("folder", ["../elsewhere", "/etc", "..", ".git", "a/b", ""])
+def test_a_plan_cannot_point_out_of_its_folder(folder, tmp_path):
+    cell = planned("SIREN").model_dump() | {"folder": folder}
+    (tmp_path / PLAN).write_text(json.dumps({"version": 1, "cells": [cell]}))
+    with pytest.raises(SdfhubError, match=r"cells\.0\.folder"):
+        read_plan(tmp_path)
+
+
+def test_a_shapes_id_cannot_point_out_of_its_folder(tmp_path):
+    outside = write_mesh(tmp_path, "secret").resolve()
+    folder = write_cell(tmp_path / "s", planned("SIREN"), [0.1e-3])
+    (cell,) = read_sweep(tmp_path / "s")
+    shape = cell.scores.shapes["known"][0]
+    write_mesh(folder, "chairs/0000")
+    assert reconstruction(cell, "known", shape, None) is not None
+    strange = shape.model_copy(update={"id": str(outside.with_suffix(""))})
+    assert reconstruction(cell, "known", strange, None) is None
+
+
+def test_names_and_reasons_are_text_in_every_format(tmp_path):
+    evil = '</script><img src=x onerror="alert(1)">{{7*7}}|$\\input{/etc/passwd}%'
+    sweep = tmp_path / "s"
+    write_cell(sweep, planned("SIREN", **{"data.x": evil}), [0.1e-3, 0.2e-3], ids="{:d}" + evil[:20])
+    failed = planned("FFT/SIREN", **{"data.x": evil})
+    enter_cells(sweep, [failed])
+    (sweep / failed.folder).mkdir()
+    (sweep / failed.folder / "failed.json").write_text(json.dumps({"reason": evil}))
+    group = only_group(sweep)
+    html = page(evil, read_sweep(sweep), [group], no_truth, 2)
+    assert "<img src=x" not in html and "onerror=&#34;" in html
+    assert html.count("</script>") == 2, "the page's own two"
+    assert "49" not in re.sub(r"[\d:-]+ UTC", "", html.split("<main>")[0]), "no template in a name is run"
+    text = markdown(tables(group))
+    assert "<img" not in text
+    assert all(line.count(" | ") == text.splitlines()[2].count(" | ") for line in text.splitlines()[2:5])
+    assert r"\input" not in latex(tables(group)) and r"\textbackslash{}input" in latex(tables(group))
+
+
+def test_the_page_fetches_nothing_and_says_so_to_the_browser(small):
+    html = page("sweep", read_sweep(small), [only_group(small)], no_truth, 2)
+    assert "default-src 'none'" in html and "'sha256-" in html
+    assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
+    assert "http:" not in html and "https:" not in html
+
+
+@pytest.mark.skipif(not shutil.which("pdflatex"), reason="no pdflatex on this machine")
+def test_the_latex_compiles(small, tmp_path):
+    enter_cells(small, [planned("SIREN", **{"loss.a_b": "50%_{x}^2~\\#&<é"})])
+    text = latex([*tables(only_group(small)), claims_table(only_group(small))])
+    (tmp_path / "table.tex").write_text(text)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "table.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout[-1500:]
+    assert (tmp_path / "table.pdf").stat().st_size > 10_000
+
+
+def test_printed_figures_are_the_papers():
+    assert PRINTED["table_small"]["FFT/HOSC", "on"] == {"cd_mean": 0.1142e-3, "cd_median": 0.0474e-3}
+    assert PRINTED["table_large"]["FFT/SIREN", "on"] == {"cd_mean": 0.0493e-3, "cd_median": 0.0249e-3}
+    assert COSTS["DeepSDF", "off"]["seconds"] / COSTS["FFT/SIREN", "on"]["seconds"] == 2.5
+
+
+def paper_table(sweep, name):
+    """The paper's own table as a sweep of one shape each, with its Table 1 as costs."""
+    for (method, normals), figures in PRINTED[name].items():
+        # two shapes with a given mean and median need three: low, median, high
+        mean, median = figures["cd_mean"], figures["cd_median"]
+        values = [median * 0.9, median, 3 * mean - 1.9 * median]
+        cost = COSTS.get((method, normals), COSTS["FFT/SIREN", "on"])
+        spent = {"seconds": cost["seconds"], "parameters": int(cost["parameters"])}
+        write_cell(sweep, planned(method, normals, sweep=name), values, **spent)
+    return {one.claim.text: one for one in verdicts(only_group(sweep))}
+
+
+@pytest.mark.parametrize("name", ["table_small", "table_large"])
+def test_the_papers_own_numbers_bear_out_its_claims_but_two(name, tmp_path):
+    """Its time is 0.4 of DeepSDF's, not a third, and no table shows orders of magnitude."""
+    found = paper_table(tmp_path / "s", name)
+    of_this_table = {claim.text for claim in CLAIMS if claim.sweep == name}
+    assert of_this_table and all(found[text].state == "holds" for text in of_this_table)
+    assert found["Less than a third of DeepSDF's parameters"].state == "holds"
+    assert found["Less than a third of DeepSDF's training time"].state == "does not hold"
+    others = {claim.text for claim in CLAIMS if claim.sweep not in ("", name)}
+    assert all(found[text].state == "not tested" for text in others)
+    normals = found["Normals significantly improve the accuracy of SIREN, FFT/SIREN and FFT/HOSC"]
+    assert normals.state == "not tested" and "not there: SIREN, normals off" in normals.figures
+
+
+def test_a_claim_that_needs_all_fails_with_one_figure_and_is_untested_without_it(small):
+    found = {one.claim.text: one for one in verdicts(only_group(small))}
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert surpasses.state == "not tested", "FFT/HOSC is not there"
+    write_cell(small, planned("FFT/HOSC", "on", 0), [0.9e-3])
+    found = {one.claim.text: one for one in verdicts(only_group(small))}
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert surpasses.state == "does not hold"
+    assert "0.9000 not < DeepSDF 0.5000" in surpasses.figures[1]
+
+
+def test_rows_of_one_method_are_told_apart_and_common_settings_stand_in_the_title(tmp_path):
+    sweep = tmp_path / "s"
+    for beta in ("1", "2"):
+        settings = {"activation.beta": beta, "trainer.max_epochs": "3"}
+        write_cell(sweep, planned("FFT/HOSC", **settings), [0.1e-3])
+    group = only_group(sweep)
+    labels = [row.label for row in group.rows]
+    assert labels == ["FFT/HOSC + normals (activation.beta=1)", "FFT/HOSC + normals (activation.beta=2)"]
+    assert group.title.endswith("1 shapes, trainer.max_epochs=3")
+
+
+def test_a_cell_under_new_defaults_replaces_its_old_one_in_the_plan(tmp_path):
+    old = planned("SIREN")
+    enter_cells(tmp_path, [old, planned("FFT/SIREN")])
+    enter_cells(tmp_path, [old.model_copy(update={"folder": "new"})])
+    assert [cell.folder for cell in read_plan(tmp_path)] == ["new", planned("FFT/SIREN").folder]
+
+
+def test_a_lock_is_held_once_and_freed(tmp_path):
+    path = tmp_path / ".lock"
+    with locked(path, patience=0) as first, locked(path, patience=0.2) as second:
+        assert (first, second) == (True, False)
+    with locked(path, patience=0) as third:
+        assert third
+
+
+def test_packed_meshes_unpack_to_the_same_places_within_a_step():
+    import base64
+
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.9)
+    mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces), "y")
+    found = packed(mesh, triangles=10_000)
+    content = base64.b64decode(found["data"])
+    places = np.frombuffer(content, "<i2", found["vertices"] * 3).reshape(-1, 3) / 32767
+    faces = np.frombuffer(content, "<u2", offset=found["vertices"] * 6).reshape(-1, 3)
+    turned = np.column_stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]])
+    np.testing.assert_allclose(places, turned, atol=1e-4)
+    np.testing.assert_array_equal(faces, mesh.faces)
+    assert packed(mesh, triangles=100)["faces"] <= 110
+
+
+def test_the_command_takes_a_folder_of_any_name_and_writes_four_files(small, monkeypatch, tmp_path, capsys):
+    strange = small.rename(tmp_path / "it's, a=[sweep] $x")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sdfhub report", str(strange), "shapes=2"])
+    report_task.main()
+    written = {path.name for path in (strange / "report").iterdir()}
+    assert written == {"table.md", "table.tex", "table.csv", "report.html"}
+    assert "DeepSDF" in capsys.readouterr().out
+
+
+def test_what_is_no_sweep_is_one_line(tmp_path):
+    with pytest.raises(SdfhubError, match="not a sweep's folder"):
+        write_report(tmp_path, tmp_path / "report")
+    (tmp_path / PLAN).write_text("{}}")
+    with pytest.raises(SdfhubError, match=r"sweep\.json"):
+        write_report(tmp_path, tmp_path / "report")
+
+
+def test_scores_are_what_training_writes():
+    from sdfhub.geometry.metrics import ShapeMetrics
+    from sdfhub.report.results import ShapeScore
+
+    assert set(ShapeScore.model_fields) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
+    assert set(score("x", 1.0)) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
+
+
+def test_a_significant_difference_needs_intervals_apart_and_noise_is_said(tmp_path):
+    text = "Normals significantly improve the accuracy of SIREN, FFT/SIREN and FFT/HOSC"
+    for name, spread, state in (("far", 0.01, "holds"), ("near", 0.5, "does not hold")):
+        for method in ("SIREN", "FFT/SIREN", "FFT/HOSC"):
+            for seed, shift in enumerate((-spread, 0, spread)):
+                for normals, cd in (("on", 1e-3), ("off", 1.5e-3)):
+                    write_cell(tmp_path / name, planned(method, normals, seed), [cd * (1 + shift)])
+        found = {one.claim.text: one for one in verdicts(only_group(tmp_path / name))}
+        assert found[text].state == state
+        assert found["Positional encoding counters the overfitting of periodic activations alone"].state == (
+            "not tested"
+        )
+    for normals, seed, cd in (("off", 0, 1e-3), ("off", 1, 3e-3)):
+        write_cell(tmp_path / "near", planned("DeepSDF", normals, seed), [cd])
+    found = {one.claim.text: one for one in verdicts(only_group(tmp_path / "near"))}
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert (surpasses.state, surpasses.within_noise) == ("holds", True)

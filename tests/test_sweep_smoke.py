@@ -1,0 +1,145 @@
+"""The smoke sweep as a user runs it: killed, started again, and its page looked at in a real browser."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sdfhub.report.results import read_sweep
+from sdfhub.report.rows import group_cells
+
+ROOT = Path(__file__).parents[1]
+
+
+def smoke_command(root: Path) -> list[str]:
+    return [
+        sys.executable,
+        str(ROOT / "train.py"),
+        "-m",
+        "sweeps=smoke",
+        f"output_root={root / 'outputs'}",
+        f"data.store={root / 'store'}",
+    ]
+
+
+@pytest.fixture(scope="module")
+def smoked(tmp_path_factory) -> dict:
+    """The smoke sweep as a user runs it: killed in its second cell, started again, run to its report."""
+    root = tmp_path_factory.mktemp("smoke")
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    sweep = root / "outputs" / "sweeps" / "smoke"
+    killed = subprocess.Popen(smoke_command(root), env=environment, stdout=subprocess.DEVNULL)
+    try:
+        limit = time.monotonic() + 300
+        while not any(sweep.glob("*seed-1*/checkpoints/last.ckpt")):
+            assert killed.poll() is None and time.monotonic() < limit
+            time.sleep(0.05)
+    finally:
+        killed.send_signal(signal.SIGKILL)
+        killed.wait()
+    states = [cell.state for cell in read_sweep(sweep)]
+    (first,) = sweep.glob("*/metrics.json")
+    written = first.stat().st_mtime_ns
+    done = subprocess.run(smoke_command(root), env=environment, capture_output=True, text=True, timeout=280)
+    return {"sweep": sweep, "states": states, "first": first, "written": written, "done": done}
+
+
+def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
+    sweep, done = smoked["sweep"], smoked["done"]
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert smoked["states"] == ["done", "missing", "missing", "missing"]
+    assert smoked["first"].stat().st_mtime_ns == smoked["written"], "a finished cell is not repeated"
+    assert "finished before" in done.stdout and "goes on from last.ckpt" in done.stdout
+    assert [cell.state for cell in read_sweep(sweep)] == ["done"] * 4
+    (group,) = group_cells(read_sweep(sweep))
+    assert [row.label for row in group.rows] == ["DeepSDF", "FFT/SIREN + normals"]
+    for row in group.rows:
+        assert [cell.scores.training.steps for cell in row.done] == [40, 40]
+        assert row.estimate("cd_mean").seeds == 2
+    html = (sweep / "report" / "report.html").read_text()
+    assert html.count("data:image/webp") >= 3 * 3 and len(html) < 10_000_000
+    assert "<polyline" in html and "<circle" in html
+    for name in ("table.md", "table.tex", "table.csv"):
+        assert "FFT/SIREN" in (sweep / "report" / name).read_text()
+
+
+def browser() -> str | None:
+    names = [os.environ.get("SDFHUB_BROWSER", ""), "chromium", "chromium-browser", "google-chrome"]
+    return next((found for name in names if name and (found := shutil.which(name))), None)
+
+
+@pytest.fixture(scope="module")
+def opened(smoked):
+    """The smoke sweep's page in a headless browser, and all it said and asked for."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    executable = browser()
+    if executable is None:
+        pytest.skip("no Chromium on PATH or in SDFHUB_BROWSER to look at the page with")
+    flags = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags += ["--no-sandbox"] if os.name == "posix" and os.geteuid() == 0 else []
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=executable, args=flags)
+        page = chromium.new_page(viewport={"width": 1280, "height": 900})
+        page.said, page.asked = [], []
+        page.on("console", lambda message: page.said.append(message.text))
+        page.on("pageerror", lambda error: page.said.append(str(error)))
+        page.on("request", lambda request: page.asked.append(request.url))
+        page.goto((smoked["sweep"] / "report" / "report.html").as_uri())
+        page.wait_for_selector("[data-drawn]", timeout=20_000)
+        yield page
+        chromium.close()
+
+
+def test_the_page_renders_in_a_browser_without_errors_or_requests(opened):
+    opened.screenshot(full_page=True)
+    assert opened.said == []
+    assert [url for url in opened.asked if not url.startswith("data:")] == [opened.url]
+    assert opened.locator("h3").all_inner_texts()[:3] == [
+        "Known shapes",
+        "Beside the paper",
+        "Held-out shapes",
+    ]
+    broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
+    assert opened.evaluate(broken) == 0 and opened.evaluate("document.images.length") >= 9
+    overflow = "document.documentElement.scrollWidth > document.documentElement.clientWidth"
+    assert not opened.evaluate(overflow), "tables scroll in their own frame"
+
+
+def test_meshes_turn_together_under_the_mouse(opened):
+    pictures = "[...document.querySelectorAll('canvas')].map(c => c.toDataURL())"
+    inked = """[...document.querySelectorAll('canvas')].map(c => c.getContext('2d')
+        .getImageData(0, 0, c.width, c.height).data.filter((v, k) => k % 4 === 3 && v > 0).length)"""
+    assert min(opened.evaluate(inked)) > 100, "every panel shows something"
+    before = opened.evaluate(pictures)
+    box = opened.locator("canvas").first
+    box.scroll_into_view_if_needed()
+    place = box.bounding_box()
+    opened.mouse.move(place["x"] + 60, place["y"] + 60)
+    opened.mouse.down()
+    opened.mouse.move(place["x"] + 120, place["y"] + 70, steps=4)
+    opened.mouse.up()
+    opened.wait_for_timeout(200)
+    after = opened.evaluate(pictures)
+    assert len(after) == len(before) >= 2
+    assert all(a != b for a, b in zip(after, before, strict=True))
+    opened.locator(".choices button").nth(1).click()
+    opened.wait_for_timeout(200)
+    assert opened.evaluate(pictures)[0] != after[0]
+    assert opened.said == []
+
+
+def test_an_injected_script_does_not_run(opened):
+    opened.evaluate("""() => {
+        const script = document.createElement('script');
+        script.textContent = 'window.injected = 1';
+        document.body.append(script);
+    }""")
+    assert opened.evaluate("window.injected") is None
+    assert any(re.search("Content Security Policy", text) for text in opened.said)
