@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
 from sdfhub.model.activations import Activation
+from sdfhub.model.blockwise import activate, activate_with_slope, kept
 from sdfhub.model.encodings import Encoding
 
 HEAD_SPREAD = 0.03
@@ -29,17 +30,22 @@ class Layer(nn.Module):
         self.columns = [hidden, encoding, code]
         self.linear = nn.Linear(sum(self.columns), outputs)
 
-    def forward(self, hidden: Tensor | None, encoded: Tensor, codes: Tensor) -> Tensor:
-        """[B, N, outputs] from hidden [B, N, H] (None in layer 0), encoded [B, N, F], codes [B, L]."""
+    def forward(self, hidden: Tensor | None, encoded: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Product [B, N, outputs] and the shift [B, 1, outputs] or [outputs] that is to be added to it.
+
+        Args:
+            hidden: [B, N, H]; None in layer 0.
+            encoded: [B, N, F]; codes: [B, L].
+        """
         from_hidden, from_encoding, from_code = self.linear.weight.split(self.columns, dim=1)
-        shift = self.linear.bias if not self.columns[2] else F.linear(codes, from_code, self.linear.bias)
-        shift = shift if shift.dim() == 1 else shift[:, None, :]
-        inputs, weight = encoded, from_encoding
-        if self.columns[0]:
-            inputs, weight = hidden, from_hidden
-            if self.columns[1]:
-                shift = shift + F.linear(encoded, from_encoding)
-        return F.linear(inputs, weight) + shift
+        parts = [part for part, columns in zip((hidden, encoded), self.columns[:2], strict=True) if columns]
+        inputs = parts[0] if len(parts) == 1 else torch.cat([part.to(hidden.dtype) for part in parts], dim=-1)
+        weight = self.linear.weight[:, : sum(self.columns[:2])]
+        shift = self.linear.bias
+        if self.columns[2]:
+            with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
+                shift = F.linear(codes, from_code, self.linear.bias)[:, None]
+        return F.linear(inputs, weight), shift
 
     def pullback(self, cotangent: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's."""
@@ -127,10 +133,15 @@ class Decoder(nn.Module):
         encoded = self.encoding(points)
         hidden = None
         for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden = activation(layer(hidden, encoded, codes))
-            if self.dropout:
-                hidden = F.dropout(hidden, self.dropout, self.training)
-        sdf = self.layers[-1](hidden, encoded, codes).squeeze(-1)
+            hidden = activate(activation, *layer(hidden, encoded, codes))
+            if self.dropout and self.training:
+                hidden = hidden * kept(hidden, self.dropout)
+        return self._head(hidden, encoded, codes)
+
+    def _head(self, hidden: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
+        with torch.autocast(hidden.device.type, enabled=False):  # a distance deserves all its digits
+            product, shift = self.layers[-1](hidden.to(encoded.dtype), encoded, codes)
+        sdf = (product + shift).squeeze(-1)
         return torch.tanh(sdf) if self.tanh else sdf
 
     def value_and_gradient(self, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
@@ -146,19 +157,19 @@ class Decoder(nn.Module):
         encoded, to_space = self.encoding.with_pullback(points)
         hidden, slopes = None, []
         for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden, slope = activation.with_slope(layer(hidden, encoded, codes))
+            hidden, slope = activate_with_slope(activation, *layer(hidden, encoded, codes))
             if self.dropout and self.training:
-                kept = F.dropout(torch.ones_like(hidden), self.dropout)
-                hidden, slope = hidden * kept, slope * kept
+                mask = kept(hidden, self.dropout)
+                hidden, slope = hidden * mask, slope * mask
             slopes.append(slope)
-        sdf = self.layers[-1](hidden, encoded, codes)
-        cotangent = torch.ones_like(sdf)
+        sdf = self._head(hidden, encoded, codes)
+        cotangent = torch.ones_like(sdf)[..., None]
         if self.tanh:
-            sdf = torch.tanh(sdf)
-            cotangent = 1 - sdf * sdf
+            cotangent = (1 - sdf * sdf)[..., None]
         by_encoding = torch.zeros_like(encoded)
         for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
             by_hidden, part = layer.pullback(cotangent)
             by_encoding = by_encoding if part is None else by_encoding + part
             cotangent = None if slope is None else by_hidden * slope
-        return sdf.squeeze(-1), to_space(by_encoding)
+        with torch.autocast(points.device.type, enabled=False):
+            return sdf, to_space(by_encoding)
