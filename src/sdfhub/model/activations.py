@@ -136,8 +136,8 @@ class Hosc(Siren):
         return wave, self.beta * slope * (1 - wave * wave)
 
     def chain(self, x, by_value, by_slope=None):
-        # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2: a' = d v and a'' = -d (omega^2 u + 2 a v^2);
-        # by log beta, a grows as d u and a' as d (v - 2 a v u).
+        # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
+        # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
         angle = self.omega * x
         u, v = torch.sin(angle).mul_(self.beta), angle.cos_().mul_(self.omega * self.beta)
         wave = torch.tanh(u)

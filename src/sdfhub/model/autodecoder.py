@@ -11,7 +11,11 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import SdfLoss
 from sdfhub.model.optim import Adam
+from sdfhub.model.pieces import Parts, loss_in_pieces
 from sdfhub.shapes import Batch
+
+POINTS_AT_ONCE = {False: 2**12, True: 2**18}
+"""By whether there is a GPU: what stays in a processor's caches, or fills a GPU and leaves most of its memory."""
 
 
 class AutoDecoder(L.LightningModule):
@@ -26,14 +30,24 @@ class AutoDecoder(L.LightningModule):
         optim: makes the optimiser and its schedule.
         steps: optimiser steps of the whole training, for the schedules. It is not asked of the trainer, whose
             answer opens the data loader before a resumed run knows where it stands.
+        points_at_once: samples that go through the decoder together; bounds memory, does not change what is
+            learned but for dropout's draw. By default what fills the machine: see POINTS_AT_ONCE.
         seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
             run repeats an uninterrupted one.
     """
 
     def __init__(
-        self, decoder: Decoder, codes: CodeTable, loss: SdfLoss, optim: Adam, steps: int, seed: int = 0
+        self,
+        decoder: Decoder,
+        codes: CodeTable,
+        loss: SdfLoss,
+        optim: Adam,
+        steps: int,
+        points_at_once: int | None = None,
+        seed: int = 0,
     ):
         super().__init__()
+        self.points_at_once = points_at_once
         self.decoder, self.codes = decoder, codes
         self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed
         self._step_started = time.perf_counter()
@@ -48,22 +62,26 @@ class AutoDecoder(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         epoch = self.global_step / max(self.trainer.num_training_batches, 1)
-        parts = self.objective(batch, self.progress, epoch)
-        loss = torch.stack(tuple(parts.values())).sum()
+        loss, parts = self.objective(batch, self.progress, epoch)
         if not torch.isfinite(loss):
             raise SdfhubError(self._divergence(parts))
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
             self._log(batch, parts, loss)
         return loss
 
-    def objective(self, batch: Batch, progress: float, epoch: float) -> dict[str, Tensor]:
-        """The weighted parts of the loss of a batch; their sum is what a step lowers.
+    def objective(self, batch: Batch, progress: float, epoch: float) -> tuple[Tensor, Parts]:
+        """The loss of a batch, which a step lowers, and its weighted parts, whose sum it is.
 
         Args:
             batch: of training shapes.
             progress: share of training done, in [0, 1].
             epoch: epochs done.
         """
+        limit = self.points_at_once or POINTS_AT_ONCE[batch.sdf.is_cuda]
+        learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        return loss_in_pieces(lambda piece: self._parts(piece, progress, epoch), batch, limit, learned)
+
+    def _parts(self, batch: Batch, progress: float, epoch: float) -> Parts:
         codes = self.codes(batch.rows)
         predicted = self.decoder(batch.points, codes)
         gradients = None

@@ -37,15 +37,14 @@ class Layer(nn.Module):
             hidden: [B, N, H]; None in layer 0.
             encoded: [B, N, F]; codes: [B, L].
         """
-        from_hidden, from_encoding, from_code = self.linear.weight.split(self.columns, dim=1)
-        parts = [part for part, columns in zip((hidden, encoded), self.columns[:2], strict=True) if columns]
-        inputs = parts[0] if len(parts) == 1 else torch.cat([part.to(hidden.dtype) for part in parts], dim=-1)
-        weight = self.linear.weight[:, : sum(self.columns[:2])]
+        from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
+        read = [part for part, columns in zip((hidden, encoded), self.columns, strict=False) if columns]
+        inputs = read[0] if len(read) == 1 else torch.cat([part.to(hidden.dtype) for part in read], dim=-1)
         shift = self.linear.bias
         if self.columns[2]:
             with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
                 shift = F.linear(codes, from_code, self.linear.bias)[:, None]
-        return F.linear(inputs, weight), shift
+        return F.linear(inputs, from_points), shift
 
     def pullback(self, cotangent: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's."""

@@ -27,7 +27,13 @@ from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
-FREE_TO_CHANGE += ("data.workers", "data.loader.workers", "data.source.root", "data.source.up")
+FREE_TO_CHANGE += (
+    "points_at_once",
+    "data.workers",
+    "data.loader.workers",
+    "data.source.root",
+    "data.source.up",
+)
 FREE_TO_CHANGE += ("trainer.max_", "trainer.enable_", "trainer.log_every_n_steps")
 FREE_TO_CHANGE += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
 """Settings under which a run may be continued though it was started with others."""
