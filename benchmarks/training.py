@@ -52,6 +52,15 @@ class RandomShape:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return cls(rows[0], rows[1], np.hstack([0.5 * normals, normals]).astype(np.float32))
 
+    def rows(self, name: str) -> int:
+        return len(getattr(self, name))
+
+    def read(self, name: str, start: int, count: int) -> np.ndarray:
+        array = getattr(self, name)
+        if start + count <= len(array):
+            return array[start : start + count].copy()
+        return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
+
 
 class ReferenceDecoder(nn.Module):
     """DeepSDF's network: 8 hidden layers of 512, input re-injected at the fourth, the code at every point."""

@@ -30,6 +30,12 @@ class FakeShape:
         normals = points / np.linalg.norm(points, axis=1, keepdims=True)
         self.surface = np.column_stack([normals * self.radius, normals]).astype(np.float32)
 
+    def rows(self, name: str) -> int:
+        return len(getattr(self, name))
+
+    def read(self, name: str, start: int, count: int) -> np.ndarray:
+        return np.take(getattr(self, name), np.arange(start, start + count), axis=0, mode="wrap")
+
 
 def batches(shapes=5, per_step=2, samples=64, surface=16, augmentation=None, seed=0) -> StepBatches:
     balls = [FakeShape(0.4 + 0.05 * index) for index in range(shapes)]

@@ -131,7 +131,7 @@ class StepBatches(Dataset):
         shape = self.shapes[index]
         axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
         samples = signed_samples(shape, self.loading.samples_per_shape, rng)
-        surface = wrapping_slice(shape.surface, self.loading.surface_per_shape, rng)
+        surface = random_rows(shape, "surface", self.loading.surface_per_shape, rng)
         if copy:
             samples *= np.append(axes, scale)
             surface *= np.concatenate([axes, np.sign(axes)])
@@ -141,8 +141,14 @@ class StepBatches(Dataset):
 def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
     """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
     inside = count // 2
-    sides = (shape.outside, count - inside), (shape.inside, inside)
-    return np.concatenate([wrapping_slice(rows, wanted, rng) for rows, wanted in sides])
+    sides = ("outside", count - inside), ("inside", inside)
+    return np.concatenate([random_rows(shape, name, wanted, rng) for name, wanted in sides])
+
+
+def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
+    start = int(rng.integers(shape.rows(name))) if count else 0
+    return shape.read(name, start, count)
 
 
 def wrapping_slice(array: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
