@@ -25,7 +25,7 @@ from hydra import compose, initialize_config_dir
 from torch import nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from sdfhub.data.datamodule import Augmentation, Loading, StepBatches
+from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.run import build_autodecoder

@@ -22,6 +22,7 @@ DTYPES = {"outside": "<f4", "inside": "<f4", "surface": "<f4", "vertices": "<f8"
 
 RECORD = "shape.json"
 
+
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
     """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
     rng = np.random.default_rng(seed)
@@ -179,7 +180,7 @@ class StoredShape:
         return int(self._files.get(name, {"rows": 0})["rows"])
 
     def read(self, name: str, start: int, count: int) -> np.ndarray:
-        """`count` rows [count, C] of an array from row `start` on, going on at the first row after the last."""
+        """`count` rows [count, C] of an array from row `start` on; after the last comes the first."""
         if not count:
             return np.zeros((0, COLUMNS[name]), DTYPES[name])
         if name not in self._offsets:
@@ -223,7 +224,8 @@ class StoredShape:
         return array
 
     def _broken(self, name: str, error: Exception) -> SdfhubError:
+        shape = [self.rows(name), COLUMNS[name]]
         return SdfhubError(
-            f"{self.folder / name}.npy: not the {[self.rows(name), COLUMNS[name]]} {DTYPES[name]} array that was "
-            f"prepared ({error}); delete {self.folder} and the store's manifest.json, then prepare again"
+            f"{self.folder / name}.npy: not the {shape} {DTYPES[name]} array that was prepared ({error}); "
+            f"delete {self.folder} and the store's manifest.json, then prepare again"
         )

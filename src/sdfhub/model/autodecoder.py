@@ -8,14 +8,12 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.codes import CodeTable
+from sdfhub.model.computing import Computing
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import SdfLoss
 from sdfhub.model.optim import Adam
 from sdfhub.model.pieces import Parts, loss_in_pieces
 from sdfhub.shapes import Batch
-
-POINTS_AT_ONCE = {False: 2**12, True: 2**18}
-"""By whether there is a GPU: what stays in a processor's caches, or fills a GPU and leaves most of its memory."""
 
 
 class AutoDecoder(L.LightningModule):
@@ -30,8 +28,7 @@ class AutoDecoder(L.LightningModule):
         optim: makes the optimiser and its schedule.
         steps: optimiser steps of the whole training, for the schedules. It is not asked of the trainer, whose
             answer opens the data loader before a resumed run knows where it stands.
-        points_at_once: samples that go through the decoder together; bounds memory, does not change what is
-            learned but for dropout's draw. By default what fills the machine: see POINTS_AT_ONCE.
+        computing: how steps are computed; by default as the device likes it.
         seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
             run repeats an uninterrupted one.
     """
@@ -43,11 +40,12 @@ class AutoDecoder(L.LightningModule):
         loss: SdfLoss,
         optim: Adam,
         steps: int,
-        points_at_once: int | None = None,
+        computing: Computing | None = None,
         seed: int = 0,
     ):
         super().__init__()
-        self.points_at_once = points_at_once
+        self.computing = computing or Computing()
+        self._value, self._value_and_gradient = decoder.forward, decoder.value_and_gradient
         self.decoder, self.codes = decoder, codes
         self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed
         self._step_started = time.perf_counter()
@@ -55,6 +53,11 @@ class AutoDecoder(L.LightningModule):
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of the shapes in table rows [B]."""
         return self.decoder(points, self.codes(rows))
+
+    def on_fit_start(self) -> None:
+        self.computing.set_matmul(self.device)
+        self._value = self.computing.compiled(self.decoder.forward, self.device)
+        self._value_and_gradient = self.computing.compiled(self.decoder.value_and_gradient, self.device)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         torch.manual_seed((self.seed << 32) + self.global_step)
@@ -77,16 +80,16 @@ class AutoDecoder(L.LightningModule):
             progress: share of training done, in [0, 1].
             epoch: epochs done.
         """
-        limit = self.points_at_once or POINTS_AT_ONCE[batch.sdf.is_cuda]
+        limit = self.computing.together(batch.sdf.device)
         learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
         return loss_in_pieces(lambda piece: self._parts(piece, progress, epoch), batch, limit, learned)
 
     def _parts(self, batch: Batch, progress: float, epoch: float) -> Parts:
         codes = self.codes(batch.rows)
-        predicted = self.decoder(batch.points, codes)
+        predicted = self._value(batch.points, codes)
         gradients = None
         if batch.surface_points.shape[1] and self.loss.wants_gradients(progress):
-            _, gradients = self.decoder.value_and_gradient(batch.surface_points, codes)
+            _, gradients = self._value_and_gradient(batch.surface_points, codes)
         return self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
 
     @property

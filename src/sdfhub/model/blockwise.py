@@ -2,7 +2,7 @@
 
 Beside its matrix products a step is some thirty elementwise passes, each as long as the memory makes it.
 Worked on in blocks, a chain of passes reads its input once and writes its result once; backward, the chain is
-recomputed from that input, so nothing in between is kept. Products may be bfloat16: in a block all is float32.
+recomputed from that input, so nothing in between is kept. Products may be bfloat16; a block is float32.
 """
 
 from collections.abc import Iterator

@@ -16,7 +16,7 @@ Parts = dict[str, Tensor]
 
 
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
-    """Batches of at most `points` samples that make up a batch, each with its share of samples and of normals.
+    """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals.
 
     Args:
         batch: [B, N] samples, [B, M] surface points.
@@ -43,8 +43,8 @@ def loss_in_pieces(
 ) -> tuple[Tensor, Parts]:
     """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
 
-    A batch of more than `points` samples is differentiated piece by piece at once: what `backward` does later is
-    hand the sum over. The plain twin is `parts_of(batch)`.
+    A batch of more than `points` samples is differentiated at once, piece by piece; `backward`
+    only has to hand the sum over. The plain twin is `parts_of(batch)`.
 
     Args:
         parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.

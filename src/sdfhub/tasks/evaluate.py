@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.datamodule import signed_samples, wrapping_slice
+from sdfhub.data.batches import signed_samples, wrapping_slice
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split

@@ -18,7 +18,7 @@ import yaml
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.codes import CodeTable
-from sdfhub.tasks.build import build, check
+from sdfhub.tasks.build import build
 
 
 def write_text(path: Path, text: str) -> None:
@@ -68,16 +68,13 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> Auto
         steps: optimiser steps of the whole training; only training needs it.
     """
     torch.manual_seed(config["seed"])
-    points_at_once = check(config.get("points_at_once"), int | None, "points_at_once")
-    if points_at_once is not None and points_at_once < 1:
-        raise SdfhubError(f"points_at_once={points_at_once}: must be at least 1, or null")
     return AutoDecoder(
         decoder=build(config["decoder"], "decoder", within="sdfhub.model"),
         codes=_codes(config, rows),
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
         steps=steps,
-        points_at_once=points_at_once,
+        computing=build(config["computing"], "computing", within="sdfhub.model"),
         seed=config["seed"],
     )
 

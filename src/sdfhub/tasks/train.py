@@ -14,7 +14,8 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from torch import Tensor
 
-from sdfhub.data.datamodule import Loading, SdfDataModule
+from sdfhub.data.batches import Loading
+from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
@@ -27,13 +28,8 @@ from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
-FREE_TO_CHANGE += (
-    "points_at_once",
-    "data.workers",
-    "data.loader.workers",
-    "data.source.root",
-    "data.source.up",
-)
+FREE_TO_CHANGE += ("computing.", "data.workers", "data.loader.workers", "data.loader.resident")
+FREE_TO_CHANGE += ("data.source.root", "data.source.up")
 FREE_TO_CHANGE += ("trainer.max_", "trainer.enable_", "trainer.log_every_n_steps")
 FREE_TO_CHANGE += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
 """Settings under which a run may be continued though it was started with others."""

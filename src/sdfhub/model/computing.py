@@ -1,0 +1,48 @@
+"""How a step is computed on the machine at hand: choices of speed and memory, not of what is learned."""
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+TOGETHER = {"cpu": 2**13, "cuda": 2**18}
+"""Samples worked on together: what stays near a processor's caches; what fills a GPU and not its memory."""
+
+
+@dataclass(frozen=True)
+class Computing:
+    """Settings that suit a device; None takes what does.
+
+    Args:
+        points_at_once: samples that go through the decoder together, >= 1; bounds memory.
+        compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
+            None: on a GPU, where there is one.
+        matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
+            (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
+    """
+
+    points_at_once: int | None = None
+    compile: bool | None = None
+    matmul: Literal["highest", "high", "medium"] | None = None
+
+    def __post_init__(self):
+        if self.points_at_once is not None and self.points_at_once < 1:
+            raise ValueError(f"points_at_once must be at least 1 or null, got {self.points_at_once}")
+
+    def together(self, device: torch.device) -> int:
+        """Samples worked on together on this device."""
+        return self.points_at_once or TOGETHER.get(device.type, TOGETHER["cuda"])
+
+    def set_matmul(self, device: torch.device) -> None:
+        """Sets the precision of this process's products."""
+        torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
+
+    def compiled(self, function: Callable, device: torch.device) -> Callable:
+        """The function itself, or what `torch.compile` makes of it on this device."""
+        wanted = self.compile
+        if wanted is None:
+            wanted = device.type == "cuda" and shutil.which(os.environ.get("CC", "cc")) is not None
+        return torch.compile(function) if wanted else function

@@ -1,0 +1,188 @@
+"""Every fast path equals its plain twin."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from sdfhub.data.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.resident import ResidentBatches
+from sdfhub.model import blockwise
+from sdfhub.model.activations import Hosc, Relu, Siren
+from sdfhub.model.blockwise import activate, activate_with_slope, kept
+from sdfhub.model.computing import Computing
+from sdfhub.model.encodings import Fourier
+from sdfhub.model.pieces import loss_in_pieces, pieces
+from sdfhub.shapes import Batch
+from tests.test_model import ACTIVATIONS as CHOICES
+from tests.test_model import small_decoder
+from tests.test_training import FakeShape
+
+ACTIVATIONS = [
+    Relu(),
+    Siren(15.0, 3.0),
+    Hosc(15.0, 3.0, 2.0, first=True),
+    Hosc(15.0, 3.0, 4.0, learn_beta=False),
+]
+
+
+def products(dtype=torch.float32, shapes=3, points=50, width=20):
+    torch.manual_seed(0)
+    product = torch.randn(shapes, points, width).to(dtype).requires_grad_()
+    return product, torch.randn(shapes, 1, width, requires_grad=True)
+
+
+@pytest.fixture
+def tiny_blocks(monkeypatch):
+    monkeypatch.setattr(blockwise, "BLOCK", 7 * 20)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("per_shape", [True, False], ids=["shift per shape", "bias"])
+@pytest.mark.parametrize("points", [50, 3], ids=["a shape in many blocks", "many shapes in a block"])
+def test_blocks_equal_autograd_through_the_plain_formula(activation, per_shape, points, tiny_blocks):
+    product, shift = products(points=points)
+    shift = shift if per_shape else torch.randn(20, requires_grad=True)
+    learned = [product, shift, *(p for p in activation.parameters() if p.requires_grad)]
+    for fast, plain in (
+        ((activate(activation, product, shift),), (activation(product + shift),)),
+        (activate_with_slope(activation, product, shift), activation.with_slope(product + shift)),
+    ):
+        for have, want in zip(fast, plain, strict=True):
+            torch.testing.assert_close(have, want)
+        given = [torch.randn_like(value) for value in plain]
+        wanted = plain if plain[-1].requires_grad else plain[:1]  # the slope of max(0, x) is constant
+        have = torch.autograd.grad(fast, learned, given)
+        want = torch.autograd.grad(wanted, learned, given[: len(wanted)])
+        for one, other in zip(have, want, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
+def test_blocks_can_be_differentiated_twice(tiny_blocks):
+    activation = Hosc(5.0, 3.0, 2.0)
+    product, shift = products()
+
+    def bent(value):
+        (slope,) = torch.autograd.grad(value.sum(), product, create_graph=True)
+        return torch.autograd.grad(slope.square().sum(), [product, shift, activation.log_beta])
+
+    fast, plain = bent(activate(activation, product, shift)), bent(activation(product + shift))
+    for have, want in zip(fast, plain, strict=True):
+        torch.testing.assert_close(have, want, rtol=1e-4, atol=1e-4)
+
+
+def test_blocks_of_bfloat16_products_are_worked_out_in_float32(tiny_blocks):
+    activation = Hosc(5.0, 3.0, 2.0)
+    product, shift = products(torch.bfloat16)
+    value, slope = activate_with_slope(activation, product, shift)
+    assert value.dtype == slope.dtype == torch.bfloat16
+    exact = activation(product.detach().float() + shift)
+    assert (value - exact).abs().max() <= 2**-8  # half a unit in the last place of numbers below 1
+    (gradient,) = torch.autograd.grad(value.sum() + slope.sum(), shift)
+    (wanted,) = torch.autograd.grad(
+        sum(part.sum() for part in activation.with_slope(product.float() + shift)), shift
+    )
+    torch.testing.assert_close(gradient, wanted, rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("dropout", [0.2, 0.5])
+def test_dropout_keeps_the_right_share_unbiased_and_seeded(dropout):
+    torch.manual_seed(3)
+    factors = kept(torch.empty(400, 500), dropout)
+    torch.manual_seed(3)
+    assert torch.equal(factors, kept(torch.empty(400, 500), dropout))
+    share = (factors == 0).float().mean()
+    assert share == pytest.approx(dropout, abs=4e-3)
+    assert factors.mean() == pytest.approx(1, abs=1e-2)
+    assert factors.max() == pytest.approx(1 / (1 - dropout), rel=1e-4)
+    neighbours = (factors[:, 1:] * factors[:, :-1]).mean()
+    assert neighbours == pytest.approx(1, abs=1e-2), "neighbours are dropped independently"
+    assert factors.mean(dim=1).std() == pytest.approx(
+        F.dropout(torch.ones(400, 500), dropout).mean(1).std(), rel=0.2
+    )
+
+
+def random_batch(shapes=5, samples=33, surface=9) -> Batch:
+    torch.manual_seed(1)
+    normals = F.normalize(torch.randn(shapes, surface, 3), dim=-1)
+    points = torch.rand(shapes, samples, 3) - 0.5
+    return Batch(
+        torch.arange(shapes), points, torch.randn(shapes, samples), torch.rand(shapes, surface, 3), normals
+    )
+
+
+@pytest.mark.parametrize("together", [1, 10, 33, 70, 1000])
+def test_a_batch_in_pieces_has_the_loss_and_gradient_of_the_whole(together):
+    batch = random_batch()
+    decoder, table = small_decoder(), torch.nn.Parameter(torch.randn(5, 4))
+
+    def parts_of(part: Batch):
+        codes = table[part.rows]
+        _, gradients = decoder.value_and_gradient(part.surface_points, codes)
+        normal = (
+            (gradients - part.surface_normals).square().sum(-1).mean()
+            if gradients.numel()
+            else table.sum() * 0
+        )
+        sdf = (decoder(part.points, codes) - part.sdf).abs().mean()
+        return {"sdf": sdf, "code": codes.square().sum(-1).mean(), "normal": normal}
+
+    learned = [table, *decoder.parameters()]
+    plain = parts_of(batch)
+    want = torch.autograd.grad(sum(plain.values()) * 3, learned)
+    loss, parts = loss_in_pieces(parts_of, batch, together, learned)
+    have = torch.autograd.grad(loss * 3, learned)
+    for name in plain:
+        torch.testing.assert_close(parts[name], plain[name])
+    for one, other in zip(have, want, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    if together < batch.sdf.numel():
+        sizes = [piece.sdf.numel() for piece, _, _ in pieces(batch, together)]
+        assert max(sizes) <= together and sum(sizes) == batch.sdf.numel()
+
+
+@pytest.mark.parametrize("copies", [0, 3])
+def test_resident_samples_give_the_batches_of_the_store(copies):
+    shapes = [FakeShape(0.4), FakeShape(0.5), FakeShape(0.6)]
+    loading = Loading(
+        4, 9001, 70, 1, 0, Augmentation(copies), seed=5
+    )  # more samples than there are rows: they wrap
+    streamed, resident = StepBatches(shapes, loading), ResidentBatches(shapes, loading, torch.device("cpu"))
+    for step in (0, 1, 7):
+        one, other = streamed[step], resident[step]
+        assert torch.equal(one.rows, other.rows)
+        for name in ("points", "sdf", "surface_points", "surface_normals"):
+            want = getattr(one, name).clamp(-1.2, 1.2)  # far distances are cut, far outside of the clamp
+            torch.testing.assert_close(getattr(other, name), want, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("choice", ["hosc", "siren", "relu"])
+def test_value_and_gradient_compile_to_one_graph(choice):
+    decoder = small_decoder(CHOICES[choice], Fourier(2))
+    points, codes = torch.rand(2, 7, 3) - 0.5, torch.randn(2, 4)
+    compiled = torch.compile(decoder.value_and_gradient, backend="aot_eager", fullgraph=True)
+    have, want = compiled(points, codes), decoder.value_and_gradient(points, codes)
+    for one, other in zip(have, want, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    learned = list(decoder.parameters())
+    derivatives = [
+        torch.autograd.grad(value.sum() + grad.square().sum(), learned) for value, grad in (have, want)
+    ]
+    for one, other in zip(*derivatives, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
+def test_computing_takes_what_suits_the_device():
+    function = len
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert Computing().together(cpu) < Computing().together(gpu)
+    assert Computing(points_at_once=5).together(gpu) == 5
+    assert Computing().compiled(function, cpu) is function
+    assert Computing(compile=False).compiled(function, gpu) is function
+    assert Computing(compile=True).compiled(function, cpu) is not function
+    with pytest.raises(ValueError, match="at least 1"):
+        Computing(points_at_once=0)
+    try:
+        Computing(matmul="medium").set_matmul(cpu)
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision("highest")
