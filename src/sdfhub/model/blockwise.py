@@ -13,8 +13,8 @@ from torch import Tensor
 
 from sdfhub.model.activations import Activation
 
-BLOCK = 2**16
-"""Numbers of a block for each thread: some five float32 arrays of it fit into 2 MiB of second-level cache."""
+BLOCK = 2**17
+"""Numbers of a block for each thread: a few float32 arrays of it stay in second-level cache."""
 
 
 def activate(activation: Activation, product: Tensor, shift: Tensor) -> Tensor:
