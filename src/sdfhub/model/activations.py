@@ -57,7 +57,7 @@ class Relu(Activation):
         return torch.relu(x), (x > 0).to(x.dtype)
 
     def chain(self, x, by_value, by_slope=None):
-        return by_value * (x > 0), ()
+        return by_value.masked_fill(x <= 0, 0), ()
 
 
 class Siren(Activation):
