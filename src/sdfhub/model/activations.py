@@ -1,17 +1,18 @@
 """Nonlinearities of the decoder, one instance per hidden layer.
 
-Each rival is a module with four duties: `forward`; `with_slope`, the same beside its derivative, from which
-the decoder computes spatial gradients; `chain`, the chain rule through both, written out so that it can run
-in blocks; and `weight_bound`, the half-width of the uniform distribution from which the weights of the linear
-layer before it are drawn.
+Each rival is a module with three duties: `forward`; `with_slope`, the same beside its derivative, from which
+the decoder computes spatial gradients; and `weight_bound`, the half-width of the uniform distribution from
+which the weights of the linear layer before it are drawn. `shifted` is where a rival may be faster than its
+plain formula: it adds what a layer owes to its shape's code and applies the activation.
 """
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+
+from sdfhub.model.waves import Wave, fits
 
 
 class Activation(nn.Module, ABC):
@@ -29,11 +30,14 @@ class Activation(nn.Module, ABC):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """a(x) and a'(x), both shaped like x and both differentiable."""
 
-    @abstractmethod
-    def chain(
-        self, x: Tensor, by_value: Tensor, by_slope: Tensor | None = None
-    ) -> tuple[Tensor, Sequence[Tensor]]:
-        """Cotangents of x and of each parameter from those of a(x) and, where it was used, of a'(x)."""
+    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
+        """a(product + shift) [B, N, W] with the dtype of `product`; shift [W] or [B, 1, W] float32."""
+        return self(product + shift).to(product.dtype)
+
+    def shifted_with_slope(self, product: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        """a(product + shift) and a'(product + shift), as `shifted`."""
+        value, slope = self.with_slope(product + shift)
+        return value.to(product.dtype), slope.to(product.dtype)
 
     @abstractmethod
     def weight_bound(self, fan_in: int) -> float:
@@ -56,8 +60,8 @@ class Relu(Activation):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return torch.relu(x), (x > 0).to(x.dtype)
 
-    def chain(self, x, by_value, by_slope=None):
-        return by_value.masked_fill(x <= 0, 0), ()
+    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
+        return self(product + shift.to(product.dtype))  # rounds as often as a cast of the result would
 
 
 class Siren(Activation):
@@ -74,6 +78,7 @@ class Siren(Activation):
     def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
         super().__init__(first)
         self.omega = omega_0 if first else omega_hidden
+        self.register_parameter("log_beta", None)  # a plain sine has no sharpness
         if self.omega <= 0:
             raise ValueError(f"omega_0 and omega_hidden must be positive, got {self.omega}")
 
@@ -87,12 +92,15 @@ class Siren(Activation):
         angle = self.omega * x
         return torch.sin(angle), self.omega * torch.cos(angle)
 
-    def chain(self, x, by_value, by_slope=None):
-        angle = self.omega * x
-        by_x = torch.cos(angle).mul_(self.omega).mul_(by_value)
-        if by_slope is not None:
-            by_x.addcmul_(angle.sin_(), by_slope, value=-(self.omega**2))
-        return by_x, ()
+    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
+        if not fits(product):
+            return super().shifted(product, shift)
+        return Wave.apply(product, shift, self.log_beta, self.omega, self.with_slope, False)
+
+    def shifted_with_slope(self, product: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        if not fits(product):
+            return super().shifted_with_slope(product, shift)
+        return Wave.apply(product, shift, self.log_beta, self.omega, self.with_slope, True)
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega}
@@ -135,25 +143,5 @@ class Hosc(Siren):
         wave = torch.tanh(self.beta * sine)
         return wave, self.beta * slope * (1 - wave * wave)
 
-    def chain(self, x, by_value, by_slope=None):
-        # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
-        # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
-        angle = self.omega * x
-        u, v = torch.sin(angle).mul_(self.beta), angle.cos_().mul_(self.omega * self.beta)
-        wave = torch.tanh(u)
-        by_u = _damped(by_value, wave)
-        by_log_beta = torch.vdot(by_u.flatten(), u.flatten())
-        if by_slope is None:
-            return by_u.mul_(v), [by_log_beta]
-        by_v = _damped(by_slope, wave)
-        bent = wave.mul_(v).mul_(2)
-        by_log_beta += torch.vdot(by_v.flatten(), torch.addcmul(v, bent, u, value=-1).flatten())
-        return by_u.mul_(v).addcmul_(by_v, bent.mul_(v).add_(u, alpha=self.omega**2), value=-1), [by_log_beta]
-
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega, "beta": self.beta.item()}
-
-
-def _damped(cotangent: Tensor, wave: Tensor) -> Tensor:
-    """cotangent * (1 - wave^2), tanh's chain rule."""
-    return torch.addcmul(cotangent, cotangent * wave, wave, value=-1)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
 from sdfhub.model.activations import Activation
-from sdfhub.model.blockwise import activate, activate_with_slope, kept
+from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Encoding
 
 HEAD_SPREAD = 0.03
@@ -132,7 +132,7 @@ class Decoder(nn.Module):
         encoded = self.encoding(points)
         hidden = None
         for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden = activate(activation, *layer(hidden, encoded, codes))
+            hidden = activation.shifted(*layer(hidden, encoded, codes))
             if self.dropout and self.training:
                 hidden = hidden * kept(hidden, self.dropout)
         return self._head(hidden, encoded, codes)
@@ -156,7 +156,7 @@ class Decoder(nn.Module):
         encoded, to_space = self.encoding.with_pullback(points)
         hidden, slopes = None, []
         for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden, slope = activate_with_slope(activation, *layer(hidden, encoded, codes))
+            hidden, slope = activation.shifted_with_slope(*layer(hidden, encoded, codes))
             if self.dropout and self.training:
                 mask = kept(hidden, self.dropout)
                 hidden, slope = hidden * mask, slope * mask

@@ -1,0 +1,213 @@
+"""sin(omega x) and tanh(beta sin(omega x)) on a processor: one pass over memory forward, one backward.
+
+As tensor operations an activation, its slope and their gradients are some thirty passes over memory, which
+cost as much as the matrix products between them. Here each direction is one loop, which numba compiles when
+it is first used (seconds) and keeps on disk. Backward recomputes from the product: nothing else is kept.
+
+bfloat16 numbers travel as the upper halves of float32 ones; all arithmetic is float32. Sines and hyperbolic
+tangents are polynomials fitted by least squares at Chebyshev nodes: errors below 1e-6.
+"""
+
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import torch
+from llvmlite import ir
+from numba.extending import intrinsic, overload
+from torch import Tensor
+
+ROWS = 128
+"""Points of one shape that a thread works on at a time."""
+
+_f = np.float32
+_FAST = {"contract", "nsz", "arcp"}
+# no "nnan": a diverged training must show; no "reassoc": it would undo the careful reduction of angles
+_PI, _PI_REST = _f(np.pi), _f(np.pi - np.float64(_f(np.pi)))
+
+
+def fits(product: Tensor) -> bool:
+    """Whether these loops take it: on the CPU, of one of their dtypes, in no graph that is being compiled."""
+    known = product.dtype in (torch.float32, torch.bfloat16)
+    return product.is_cpu and known and product.numel() > 0 and not torch.compiler.is_compiling()
+
+
+class Wave(torch.autograd.Function):
+    """a(product + shift), and with it a' where asked for: `Wave.apply(product, shift, log_beta, ...)`.
+
+    Args:
+        product: [B, N, W], such that `fits`.
+        shift: [W] or [B, 1, W] float32.
+        log_beta: logarithm of the sharpness, a scalar tensor; None for a plain sine.
+        omega: frequency factor.
+        plain: x -> a(x), a'(x) as tensor operations, for whoever differentiates the gradient once more.
+        with_slope: whether a' is returned too.
+
+    Returns:
+        [B, N, W] with the dtype of `product`, or two of them.
+    """
+
+    @staticmethod
+    def forward(ctx, product, shift, log_beta, omega: float, plain: Callable, with_slope: bool):
+        ctx.omega, ctx.plain, ctx.with_slope = omega, plain, with_slope
+        ctx.save_for_backward(product, shift, log_beta)
+        outputs = [
+            torch.empty_like(product, memory_format=torch.contiguous_format) for _ in range(1 + with_slope)
+        ]
+        slope = _flat(outputs[1]) if with_slope else None
+        _with_threads(_forward, *_given(ctx, product, shift, log_beta), _flat(outputs[0]), slope)
+        return tuple(outputs) if with_slope else outputs[0]
+
+    @staticmethod
+    def backward(ctx, by_value, by_slope=None):
+        product, shift, log_beta = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            return *_differentiable(ctx, by_value, by_slope), None, None, None
+        shapes, points, width = product.shape
+        chunks = shapes * -(-points // ROWS)
+        by_product = product.new_empty(product.shape)
+        by_shift, by_log_beta = torch.empty(2, chunks, width)
+        cotangents = _flat(by_value), None if by_slope is None else _flat(by_slope)
+        results = _flat(by_product), by_shift.numpy(), by_log_beta.numpy()
+        _with_threads(_backward, *_given(ctx, product, shift, log_beta), *cotangents, *results)
+        by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
+        return by_product, by_shift, None if log_beta is None else by_log_beta.sum(), None, None, None
+
+
+def _given(ctx, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
+    beta = None if log_beta is None else _f(log_beta.exp().item())
+    return _flat(product), _flat(shift), product.shape[1], _f(ctx.omega), beta
+
+
+def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tensor | None]:
+    outputs = ctx.plain(ctx.saved_tensors[0] + ctx.saved_tensors[1])
+    cotangents = [by_value, by_slope][: 1 + ctx.with_slope]
+    outputs = [out.to(by.dtype) for out, by in zip(outputs, cotangents, strict=False)]
+    wanted = [tensor is not None and tensor.requires_grad for tensor in ctx.saved_tensors]
+    inputs = [tensor for tensor, is_wanted in zip(ctx.saved_tensors, wanted, strict=True) if is_wanted]
+    found = iter(torch.autograd.grad(outputs, inputs, cotangents, create_graph=True))
+    return [next(found) if is_wanted else None for is_wanted in wanted]
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    """[rows, W] of the same memory."""
+    rows = tensor.detach().contiguous().view(-1, tensor.shape[-1])
+    return rows.view(torch.uint16).numpy() if rows.dtype == torch.bfloat16 else rows.numpy()
+
+
+def _with_threads(kernel, *arguments) -> None:
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    kernel(*arguments)
+
+
+@intrinsic
+def _as_float(context, bits):
+    signature = numba.float32(numba.uint32)
+    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.FloatType())
+
+
+@intrinsic
+def _as_bits(context, number):
+    signature = numba.uint32(numba.float32)
+    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.IntType(32))
+
+
+def _widened(number):
+    """A float32 from a float32 or a bfloat16's bits."""
+
+
+def _narrowed(number, like):
+    """A float32 as what `like` is: itself, or the bits of the nearest bfloat16."""
+
+
+@overload(_widened, inline="always")
+def _(number):
+    if isinstance(number, numba.types.Integer):
+        return lambda number: _as_float(np.uint32(number) << np.uint32(16))
+    return lambda number: number
+
+
+@overload(_narrowed, inline="always")
+def _(number, like):
+    if isinstance(like, numba.types.Integer):
+
+        def rounded(number, like):
+            bits = _as_bits(number)
+            odd = (bits >> np.uint32(16)) & np.uint32(1)
+            return np.uint16((bits + np.uint32(0x7FFF) + odd) >> np.uint32(16))
+
+        return rounded
+    return lambda number, like: number
+
+
+@numba.njit(inline="always", fastmath=_FAST)
+def _sin_cos(angle):
+    half_turns = np.rint(angle * _f(1 / np.pi))
+    rest = (angle - half_turns * _PI) - half_turns * _PI_REST  # in [-pi/2, pi/2]
+    sign = _f(1) - _f(2) * (half_turns - _f(2) * np.floor(half_turns * _f(0.5)))
+    s = rest * rest
+    sine = _f(0.008333016) + s * (_f(-0.00019806546) + s * _f(2.5999025e-06))
+    sine = rest + rest * s * (_f(-0.16666657) + s * sine)
+    cosine = _f(-0.0013888568) + s * (_f(2.476924e-05) + s * _f(-2.6192475e-07))
+    cosine = _f(1) + s * (_f(-0.5) + s * (_f(0.041666657) + s * cosine))
+    return sine * sign, cosine * sign
+
+
+@numba.njit(inline="always", fastmath=_FAST)
+def _tanh(x):
+    x = min(max(x, _f(-9)), _f(9))
+    s = x * x
+    over = _f(0.0034865936) + s * (_f(2.0471998e-05) + s * _f(1.3184417e-08))
+    under = _f(0.025842024) + s * (_f(0.00032713933) + s * _f(7.702751e-07))
+    over = _f(0.9999999) + s * (_f(0.13373208) + s * over)
+    return x * over / (_f(1) + s * (_f(0.46706504) + s * under))
+
+
+@numba.njit(parallel=True, fastmath=_FAST, cache=True)
+def _forward(product, shift, points, omega, beta, value, slope):
+    per_shape = -(-points // ROWS)
+    for chunk in numba.prange(product.shape[0] // points * per_shape):
+        shape, part = chunk // per_shape, chunk % per_shape
+        line = shape if len(shift) > 1 else 0
+        for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
+            for j in range(product.shape[1]):
+                sine, cosine = _sin_cos(omega * (_widened(product[p, j]) + shift[line, j]))
+                a, d = sine, omega * cosine
+                if beta is not None:
+                    a = _tanh(beta * sine)
+                    d = beta * d * (_f(1) - a * a)
+                value[p, j] = _narrowed(a, product[p, j])
+                if slope is not None:
+                    slope[p, j] = _narrowed(d, product[p, j])
+
+
+@numba.njit(parallel=True, fastmath=_FAST, cache=True)
+def _backward(product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta):
+    # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
+    # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
+    per_shape = -(-points // ROWS)
+    for chunk in numba.prange(product.shape[0] // points * per_shape):
+        shape, part = chunk // per_shape, chunk % per_shape
+        line = shape if len(shift) > 1 else 0
+        by_shift[chunk], by_log_beta[chunk] = 0, 0
+        for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
+            for j in range(product.shape[1]):
+                u, cosine = _sin_cos(omega * (_widened(product[p, j]) + shift[line, j]))
+                v = omega * cosine
+                g = _widened(by_value[p, j])
+                if beta is None:
+                    by_x = g * v
+                    if by_slope is not None:
+                        by_x -= _widened(by_slope[p, j]) * omega * omega * u
+                else:
+                    u, v = beta * u, beta * v
+                    a = _tanh(u)
+                    d = _f(1) - a * a
+                    by_x = d * g * v
+                    by_log_beta[chunk, j] += d * g * u
+                    if by_slope is not None:
+                        by_v, bent = d * _widened(by_slope[p, j]), _f(2) * a * v
+                        by_x -= by_v * (bent * v + omega * omega * u)
+                        by_log_beta[chunk, j] += by_v * (v - bent * u)
+                by_product[p, j] = _narrowed(by_x, product[p, j])
+                by_shift[chunk, j] += by_x
