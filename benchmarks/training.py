@@ -1,4 +1,4 @@
-"""Training steps side by side with DeepSDF's: samples a second, and the share of the GEMM limit.
+"""Training steps and dense evaluation side by side with DeepSDF's: samples a second, share of the GEMM limit.
 
     python benchmarks/training.py [--shapes 4] [--samples 4096] [--rounds 5] [--threads N] [overrides]
 
@@ -7,7 +7,8 @@ printed are medians over the rounds. DeepSDF's step is re-implemented here from 
 (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the batch, its
 prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours include the
 draw of their samples from the store. Only samples with a signed distance are counted: what normals cost is
-on our account.
+on our account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
+decoder, timed in the same rounds.
 """
 
 import argparse
@@ -142,24 +143,48 @@ class OurStep:
         self.optimizer.step()
         self.step += 1
 
-    def operations(self, samples: int, surface: int) -> float:
-        """Multiplications and additions of matrix products in a step, for each shape."""
-        per_point = 0
-        for layer in self.model.decoder.layers:
-            per_point += 2 * sum(layer.columns[:2]) * layer.linear.out_features
+    def operations(self) -> float:
+        """Multiplications and additions of matrix products in a step."""
+        loading = self.batches.loading
         # forward and two products backward; the written-out gradient is as much again
-        return 3 * per_point * (samples + 2 * surface)
+        points = 3 * (loading.samples_per_shape + 2 * loading.surface_per_shape)
+        return operations_per_point(self.model.decoder) * points * self.batches.rows
 
 
-def gemm_rate(width: int, rows: int, dtype: torch.dtype = torch.float32, repeats: int = 7) -> float:
-    """Operations a second of the product [rows, width] x [width, width], the best of a few."""
-    a, b = torch.randn(rows, width, dtype=dtype), torch.randn(width, width, dtype=dtype)
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        a @ b
-        seconds.append(time.perf_counter() - start)
-    return 2 * rows * width * width / min(seconds)
+class OurField:
+    """Dense evaluation of a decoder, as meshing calls it."""
+
+    def __init__(self, choice: list[str], points: int):
+        config = plain(compose("config", overrides=choice))
+        self.model, self.bf16 = build_autodecoder(config, rows=1).eval(), False
+        self.points = torch.rand(1, points, 3) - 0.5
+
+    @torch.no_grad()
+    def __call__(self) -> None:
+        codes = self.model.codes.table
+        for part in self.points.split(self.model.computing.together(codes.device), dim=1):
+            self.model.decoder(part, codes)
+
+    def operations(self) -> float:
+        return operations_per_point(self.model.decoder) * self.points.shape[1]
+
+
+def operations_per_point(decoder) -> int:
+    """Multiplications and additions of a forward pass at one point; a code's share is once per shape."""
+    return sum(2 * sum(layer.columns[:2]) * layer.linear.out_features for layer in decoder.layers)
+
+
+class Product:
+    """The limit: one matrix product of a layer's size."""
+
+    def __init__(self, width: int, dtype: torch.dtype, rows: int):
+        self.a, self.b = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
+
+    def __call__(self) -> None:
+        torch.mm(self.a, self.b)
+
+    def operations(self) -> float:
+        return 2 * self.a.numel() * self.b.shape[1]
 
 
 def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
@@ -171,6 +196,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     paper = ["decoder=paper_585k", "encoding=fourier", "encoding.frequencies=12", *args.overrides]
     deepsdf = ["experiment=deepsdf", *args.overrides]
     surface = args.samples // 4  # as at scale=paper
+    rows = args.shapes * args.samples
     made: dict[str, object] = {"DeepSDF, reference": ReferenceStep(files, args.samples)}
     for bf16 in (False, True):
         suffix = ", bf16" if bf16 else ""
@@ -184,6 +210,12 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
                 shapes, args.samples, surface, ["activation=siren", *paper], bf16
             ),
         }
+    fields = {
+        "decoder=deepsdf": deepsdf,
+        "paper_585k, HOSC": paper,
+        "paper_585k, SIREN": ["activation=siren", *paper],
+    }
+    made |= {f"{name}, evaluation": OurField(choice, rows) for name, choice in fields.items()}
     return made
 
 
@@ -206,32 +238,53 @@ def main() -> None:
         initialize_config_dir(str(CONF), version_base=None),
     ):
         steps = rivals(args, Path(folder))
-        seconds = {name: [] for name in steps}
+        limits = limits_of(steps)
+        times = {name: [] for name in (*steps, *limits)}
         for round_ in range(args.rounds + 1):  # the first warms up
-            for name, step in steps.items():
+            for name, step in (steps | limits).items():
                 start = time.perf_counter()
                 step()
                 if round_:
-                    seconds[name].append(time.perf_counter() - start)
-    report(args, steps, {name: statistics.median(times) for name, times in seconds.items()})
+                    times[name].append(time.perf_counter() - start)
+    report(args, steps, limits, {name: statistics.median(taken) for name, taken in times.items()})
 
 
-def report(args: argparse.Namespace, steps: dict[str, object], seconds: dict[str, float]) -> None:
-    """Prints a Markdown table."""
+def limits_of(steps: dict[str, object]) -> dict[tuple, Product]:
+    """The products to measure, by width and whether they are bfloat16."""
+    made = {}
+    for step in steps.values():
+        if hasattr(step, "operations"):
+            key = limit_of(step)
+            together = step.model.computing.together(torch.device("cpu"))
+            made[key] = Product(key[0], torch.bfloat16 if key[1] else torch.float32, together)
+    return made
+
+
+def limit_of(step) -> tuple[int, bool]:
+    """Width of a step's decoder, and whether its products are bfloat16."""
+    return max(sum(layer.columns[:2]) for layer in step.model.decoder.layers), step.bf16
+
+
+def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -> None:
+    """Prints Markdown tables."""
     rows = args.shapes * args.samples
-    rate = {dtype: gemm_rate(512, rows, dtype) for dtype in (torch.float32, torch.bfloat16)}
+    rate = {key: product.operations() / seconds[key] for key, product in limits.items()}
     print(f"{torch.get_num_threads()} threads, {args.shapes} shapes x {args.samples} samples a step")
-    rates = ", ".join(f"{str(dtype)[6:]} {value / 1e9:.0f}" for dtype, value in rate.items())
-    print(f"GEMM 512 wide, G operations a second: {rates}")
-    print("\n| step | samples/s | times DeepSDF | share of the GEMM rate |\n| --- | --- | --- | --- |")
+    for (width, bf16), value in rate.items():
+        print(
+            f"product {width} wide, {'bfloat16' if bf16 else 'float32'}: {value / 1e9:.0f} G operations a second"
+        )
+    print("\n| step | samples/s | times DeepSDF | share of the product's rate |\n| --- | --- | --- | --- |")
     reference = seconds["DeepSDF, reference"]
-    for name, taken in seconds.items():
-        step, share = steps[name], ""
-        if isinstance(step, OurStep):
-            operations = args.shapes * step.operations(args.samples, step.batches.loading.surface_per_shape)
-            limit = rate[torch.bfloat16 if step.bf16 else torch.float32]
-            share = f"{operations / taken / limit:.2f}"
-        print(f"| {name} | {rows / taken:,.0f} | {reference / taken:.2f} | {share} |")
+    for name, step in steps.items():
+        share = ""
+        if hasattr(step, "operations"):
+            share = f"{step.operations() / seconds[name] / rate[limit_of(step)]:.2f}"
+        times = "" if isinstance(step, OurField) else f"{reference / seconds[name]:.2f}"
+        print(f"| {name} | {rows / seconds[name]:,.0f} | {times} | {share} |")
+    for bf16 in ("", ", bf16"):
+        on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
+        print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")
 
 
 if __name__ == "__main__":
