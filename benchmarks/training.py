@@ -271,9 +271,8 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -
     rate = {key: product.operations() / seconds[key] for key, product in limits.items()}
     print(f"{torch.get_num_threads()} threads, {args.shapes} shapes x {args.samples} samples a step")
     for (width, bf16), value in rate.items():
-        print(
-            f"product {width} wide, {'bfloat16' if bf16 else 'float32'}: {value / 1e9:.0f} G operations a second"
-        )
+        dtype = "bfloat16" if bf16 else "float32"
+        print(f"product {width} wide, {dtype}: {value / 1e9:.0f} G operations a second")
     print("\n| step | samples/s | times DeepSDF | share of the product's rate |\n| --- | --- | --- | --- |")
     reference = seconds["DeepSDF, reference"]
     for name, step in steps.items():
