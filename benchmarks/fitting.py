@@ -19,7 +19,7 @@ import torch
 import yaml
 from runs import ROOT, train
 
-from sdfhub.data.datamodule import signed_samples
+from sdfhub.data.batches import signed_samples
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
 from sdfhub.geometry.metrics import judge
