@@ -1,5 +1,6 @@
 """Every fast path equals its plain twin."""
 
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 
 import pytest
@@ -78,6 +79,15 @@ def test_numbers_that_are_not_finite_stay_so():
     product = torch.tensor([[[float("nan"), float("inf"), 1.0]]])
     value = Hosc(5.0, 3.0, 2.0).shifted(product, torch.zeros(3))
     assert value[0, 0, :2].isnan().all() and value[0, 0, 2].isfinite()
+
+
+def test_the_loops_leave_pytorchs_threads_alone_and_take_callers_from_several_threads():
+    threads = torch.get_num_threads()
+    product, shift = products()
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: Siren(15.0, 3.0).shifted(product, shift), range(16)))
+    assert all(torch.equal(value, found[0]) for value in found)
+    assert torch.get_num_threads() == threads
 
 
 def test_the_loops_gradient_can_be_differentiated_again():

@@ -8,6 +8,7 @@ bfloat16 numbers travel as the upper halves of float32 ones; all arithmetic is f
 tangents are polynomials fitted by least squares at Chebyshev nodes: errors below 1e-6.
 """
 
+import threading
 from collections.abc import Callable
 
 import numba
@@ -19,6 +20,10 @@ from torch import Tensor
 
 ROWS = 128
 """Points of one shape that a thread works on at a time."""
+
+_LOCK = threading.Lock()
+numba.config.THREADING_LAYER = "workqueue"
+# numba's OpenMP layer would change the number of threads that PyTorch uses; this one takes one caller at a time
 
 _f = np.float32
 _FAST = {"contract", "nsz", "arcp"}
@@ -96,8 +101,9 @@ def _flat(tensor: Tensor) -> np.ndarray:
 
 
 def _with_threads(kernel, *arguments) -> None:
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
-    kernel(*arguments)
+    with _LOCK:
+        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+        kernel(*arguments)
 
 
 @intrinsic
