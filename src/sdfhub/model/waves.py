@@ -23,7 +23,7 @@ ROWS = 128
 
 _LOCK = threading.Lock()
 numba.config.THREADING_LAYER = "workqueue"
-# numba's OpenMP layer would change the number of threads that PyTorch uses; this one takes one caller at a time
+# numba's OpenMP layer would change PyTorch's number of threads; this one takes one caller at a time
 
 _f = np.float32
 _FAST = {"contract", "nsz", "arcp"}
