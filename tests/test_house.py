@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ FORBIDDEN_IMPORTS = {
     "report": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.model"),
 }
 FORBIDDEN_NAMES = {"utils", "util", "helpers", "helper", "manager", "base", "common"}
+AT_TOP = (ast.Import, ast.ImportFrom)
 MACHINE_PATH = re.compile(r"""["'`(\s=](/(?:home|work|tmp|root|Users|mnt|data|opt|scratch)/\w|[A-Z]:\\\w)""")
 
 
@@ -25,9 +27,14 @@ def ids(path):
 
 def imported_modules(path: Path) -> set[str]:
     """Absolute names of all that a file imports, wherever in the file it does so."""
-    package = list(path.relative_to(SOURCE.parent).parent.parts)
+    nodes = ast.walk(ast.parse(path.read_text()))
+    return imported_by(nodes, list(path.relative_to(SOURCE.parent).parent.parts))
+
+
+def imported_by(nodes: Iterable[ast.AST], package: list[str]) -> set[str]:
+    """Absolute names of what import statements of a package's file import."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -70,6 +77,31 @@ def test_a_module_is_named_for_the_thing_in_it(path):
 @pytest.mark.parametrize("path", FILES, ids=ids)
 def test_a_file_is_short(path):
     assert len(path.read_text().splitlines()) <= 350
+
+
+def imported_at_start(module: str) -> set[str]:
+    """All that importing a module of the house imports, as far as the house's own files say so."""
+    found, waiting = set(), [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        waiting += [name.rpartition(".")[0]] * ("." in name)
+        file = SOURCE.parent.joinpath(*name.split("."))
+        file = file / "__init__.py" if file.is_dir() else file.with_suffix(".py")
+        if name.startswith("sdfhub") and file.is_file():
+            top = [node for node in ast.parse(file.read_text()).body if isinstance(node, AT_TOP)]
+            waiting += imported_by(top, list(file.relative_to(SOURCE.parent).parent.parts))
+    return found
+
+
+@pytest.mark.parametrize("slow", ["trimesh", "tensorboard", "jinja2", "playwright"])
+def test_a_training_starts_without(slow):
+    """Hydra imports the callback of sweeps whenever it starts."""
+    found = imported_at_start("sdfhub.tasks.train") | imported_at_start("sdfhub.tasks.sweep")
+    assert {"torch", "sdfhub.data.store", "sdfhub.tasks.prepare"} <= found
+    assert slow not in found
 
 
 def test_train_is_at_most_15_lines():

@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from sdfhub.data.ac3d import read_ac3d
 from sdfhub.errors import RejectedMesh, SdfhubError
@@ -65,6 +64,8 @@ def triangles_of(
 
 
 def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
+
     options = {}
     if suffix in (".obj", ".off"):
         content = _utf8(content)
@@ -97,8 +98,11 @@ def _check_triangles(vertices: np.ndarray, faces: np.ndarray, name: str) -> None
         raise RejectedMesh("non_finite_vertices", f"{name} has {count} vertices that are not finite")
 
 
-class _Beside(trimesh.resolvers.Resolver):
-    """Gives a .gltf the buffers that lie below its own folder and nothing else: its paths are not trusted."""
+class _Beside:
+    """Gives a .gltf the buffers that lie below its own folder and nothing else: its paths are not trusted.
+
+    A resolver to trimesh, by its methods rather than by descent, which would import trimesh.
+    """
 
     def __init__(self, folder: Path | None):
         self.folder = folder
@@ -108,6 +112,12 @@ class _Beside(trimesh.resolvers.Resolver):
         if path is None:
             raise FileNotFoundError(f"its buffer {name!r} does not lie beside it")
         return path.read_bytes()
+
+    def __getitem__(self, name: str) -> bytes:
+        return self.get(name)
+
+    def __contains__(self, name: str) -> bool:
+        return False
 
     def keys(self):
         return []

@@ -1,7 +1,8 @@
 """One mesh in, signed samples out."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
 
 from sdfhub.data.normalize import face_normals, normalize_mesh
 from sdfhub.data.preparation import DEFAULT, Preparation
@@ -10,12 +11,17 @@ from sdfhub.data.visibility import Surface, closed_surface, points_on_faces, vis
 from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
 
+if TYPE_CHECKING:
+    import trimesh
+
 PROBES = 2000
 """Samples on which the fast path must agree with the winding number."""
 
 
 def prepare_mesh(
-    mesh: trimesh.Trimesh | tuple[np.ndarray, np.ndarray], preparation: Preparation = DEFAULT, seed: int = 0
+    mesh: "trimesh.Trimesh | tuple[np.ndarray, np.ndarray]",
+    preparation: Preparation = DEFAULT,
+    seed: int = 0,
 ) -> ShapeSamples:
     """Signed distances and oriented surface points of one mesh, however broken, in the normalised frame.
 

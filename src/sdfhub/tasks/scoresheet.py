@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from sdfhub.data.shards import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
@@ -119,6 +118,8 @@ def _write_mesh(row: Judged, path: Path) -> None:
     """The reconstruction as PLY, back in its source's frame; nothing where there is no surface."""
     if not len(row.faces):
         return
+    import trimesh  # here: slow to import, and every training would wait for it before its first step
+
     vertices = row.vertices / row.shape.scale + row.shape.center
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".part.ply")

@@ -13,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
 from sdfhub.tasks.cells import planned_cell
-from sdfhub.tasks.report import write_report
 
 
 class SweepRecord(Callback):
@@ -38,6 +37,8 @@ class SweepRecord(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         if not _is_training(config):
             return
+        from sdfhub.tasks.report import write_report  # here: Hydra imports this file at every start
+
         sweep = Path(config.hydra.sweep.dir)
         try:
             write_report(sweep, sweep / "report")

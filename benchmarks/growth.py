@@ -1,0 +1,181 @@
+"""How training grows with the number of shapes: start-up, samples a second, peak memory, size of the codes.
+
+    python benchmarks/growth.py [--rounds 3] [--steps 100] [--real 20] [--keep]
+
+Runs train.py on 10, 100 and 1000 procedural tables of 500,000 samples from a warm store, the counts one after
+the other in every round, and prints medians over the rounds as a Markdown table; beside them what importing
+torch and lightning alone costs here. Steps are the same for all: 10 shapes, 512 samples and 64 surface points
+of each. Then it times the drawing of such batches from 1000 shapes by itself.
+
+Only the first `--real` shapes are prepared; the others' files are copies of theirs, written under their own
+ids and fingerprints: speed and memory depend on the number and size of files, not on what they hold.
+`--real 1000` prepares all (about an hour a core). The store takes 9 GB under outputs/benchmarks/growth, and
+goes at the end unless --keep.
+
+Start-up lasts from the start of the process to the end of its first optimiser step; its processor time is
+read from /proc every 20th of a second, and tells more than the clock on a machine that others use. Memory is
+the peak resident set of the training process, libraries and all: `ru_maxrss` of wait4; it has no children.
+"""
+
+import argparse
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sdfhub.data import shards, store
+from sdfhub.data.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.sampling import Preparation
+from sdfhub.data.sources import ProceduralSource
+from sdfhub.data.splits import split
+from sdfhub.data.store import Store
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "outputs" / "benchmarks" / "growth"
+COUNTS = (10, 100, 1000)
+PER_STEP, SAMPLES, SURFACE = 10, 512, 64
+WARM_UP = 20
+"""Steps left out of the speed."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What one run of train.py took: seconds, of the processor too, samples a second, bytes."""
+
+    start_up: float
+    processor: float
+    speed: float
+    memory: int
+    codes: int
+    checkpoint: int
+
+
+def filled_store(real: int) -> Store:
+    """The store of as many tables as the largest count, `real` of them prepared, the others copied."""
+    source, preparation = ProceduralSource({"tables": {}}, count=COUNTS[-1]), Preparation()
+    shapes = split(source.shapes(), train=None, test=0, seed=0).train
+    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store"))
+    folder = FOLDER / "store" / source.name / store.preparation_hash(preparation)
+    for index, shape in enumerate(shapes[real:]):
+        if shards.read_record(folder / shape.id) is None:
+            copy_shape(prepared[index % len(prepared)], folder / shape.id, shape.fingerprint)
+    return store.prepare(source, shapes, preparation, FOLDER / "store")  # enters what the folders hold
+
+
+def copy_shape(twin: shards.StoredShape, folder: Path, fingerprint: str) -> None:
+    """Writes the arrays of a prepared shape as those of another."""
+    names = [name for name in shards.COLUMNS if twin.rows(name)]
+    record = shards.read_record(twin.folder) | {"fingerprint": fingerprint}
+    shards.write_shape(folder, {name: twin.read(name, 0, twin.rows(name)) for name in names}, record)
+
+
+def trained(shapes: int, steps: int) -> Growth:
+    """Trains `steps` steps on the first shapes of the store."""
+    run = FOLDER / f"run_{shapes}"
+    shutil.rmtree(run, ignore_errors=True)
+    overrides = [
+        *("category=tables", f"data.shapes={shapes}", "data.held_out=0", f"data.store={FOLDER / 'store'}"),
+        *(f"data.loader.shapes_per_step={PER_STEP}", f"data.loader.samples_per_shape={SAMPLES}"),
+        *(f"data.loader.surface_per_shape={SURFACE}", "callbacks=none", "evaluate.known=0"),
+        *("trainer=cpu", "trainer.max_epochs=1", "trainer.log_every_n_steps=1"),
+        *(f"data.loader.passes_per_epoch={steps * PER_STEP // shapes}", f"hydra.run.dir={run}"),
+    ]
+    started = time.time()
+    spent, memory = watched([sys.executable, "train.py", *overrides])
+    events = EventAccumulator(str(run / "tensorboard")).Reload().Scalars("loss/total")
+    times = [event.wall_time for event in events]
+    speed = (len(times) - 1 - WARM_UP) * PER_STEP * SAMPLES / (times[-1] - times[WARM_UP])
+    path = run / "checkpoints" / "last.ckpt"
+    table = torch.load(path, weights_only=True)["state_dict"]["codes.table"]
+    processor = max(seconds for moment, seconds in spent if moment <= times[0])
+    return Growth(times[0] - started, processor, speed, memory, table.numel() * 4, path.stat().st_size)
+
+
+def watched(command: list[str]) -> tuple[list[tuple[float, float]], int]:
+    """Moments with the processor's seconds spent by then, and peak resident bytes, of a command."""
+    process, spent, ended = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr), [], 0
+    while not ended:
+        ticks = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+        spent.append((time.time(), sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")))
+        time.sleep(0.05)
+        ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"{' '.join(command)}: exit status {process.returncode}")
+    return spent, usage.ru_maxrss * 1024
+
+
+def imports() -> tuple[float, float]:
+    """Seconds, and the processor's, that a process takes to import torch and lightning."""
+    # torch imports its compiler when the first optimiser is made: every training pays for it
+    spent, _ = watched([sys.executable, "-c", "import torch._dynamo, lightning.pytorch"])
+    return spent[-1][0] - spent[0][0], spent[-1][1]
+
+
+def draw_times(shapes: Store) -> tuple[float, float]:
+    """Seconds to draw a step's batch, while shapes are seen for the first time and later."""
+    augmentation = Augmentation()
+    loading = Loading(PER_STEP, SAMPLES, SURFACE, 1, workers=0, augmentation=augmentation, seed=0)
+    batches = StepBatches(list(shapes), loading)
+    seconds = []
+    for step in range(2 * len(batches)):
+        start = time.perf_counter()
+        batches[step]
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[: len(batches)]), statistics.median(seconds[len(batches) :])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=100, help="a multiple of 100")
+    parser.add_argument("--real", type=int, default=20, help="shapes to prepare; the others are copies")
+    parser.add_argument("--keep", action="store_true", help="leave the store for the next time")
+    arguments = parser.parse_args()
+    shapes = filled_store(arguments.real)
+    try:
+        report(shapes, arguments)
+    finally:
+        if not arguments.keep:
+            shutil.rmtree(FOLDER)
+
+
+def report(shapes: Store, arguments: argparse.Namespace) -> None:
+    """Measures and prints."""
+    trained(COUNTS[0], arguments.steps)  # compiles what is compiled once and kept
+    found, alone = {shapes: [] for shapes in COUNTS}, []
+    for _ in range(arguments.rounds):
+        alone.append(imports())
+        for count in COUNTS:
+            found[count].append(trained(count, arguments.steps))
+    size = sum(file.stat().st_size for file in shapes.folder.rglob("*.npy"))
+    prepared = min(arguments.real, len(shapes))
+    print(f"Store: {len(shapes)} shapes, {size / 1e9:.1f} GB; {prepared} prepared, the others copies.\n")
+    print("| shapes | start-up s | of the processor | samples/s | memory GB | codes MB | checkpoint MB |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for count, runs in found.items():
+        middle = {name: statistics.median(getattr(run, name) for run in runs) for name in vars(runs[0])}
+        print(
+            f"| {count} | {middle['start_up']:.2f} | {middle['processor']:.2f} | {middle['speed']:,.0f} "
+            f"| {middle['memory'] / 1e9:.3f} | {middle['codes'] / 1e6:.3f} "
+            f"| {middle['checkpoint'] / 1e6:.2f} |"
+        )
+    first, later = draw_times(shapes)
+    step = statistics.median(PER_STEP * SAMPLES / run.speed for run in found[COUNTS[-1]])
+    clock, processor = (statistics.median(each) for each in zip(*alone, strict=True))
+    print(f"\nImporting torch and lightning alone: {clock:.2f} s, {processor:.2f} s of the processor.")
+    print(
+        f"Drawing a batch from {len(shapes)} shapes: {first * 1e3:.2f} ms when they are first seen, "
+        f"{later * 1e3:.2f} ms later, of a step's {step * 1e3:.1f} ms."
+    )
+
+
+if __name__ == "__main__":
+    main()
