@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry import marching, mesher
+from sdfhub.geometry.coarse_to_fine import Judged
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
 from sdfhub.geometry.metrics import is_closed
 
@@ -182,7 +183,9 @@ def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
     want = mesh_dense(torus, 96)
     index = (want[0][0] + 1) * 95 / 2
     seen = np.array([[0, *(index // 2).astype(int)]])
-    monkeypatch.setattr(mesher, "candidate_blocks", lambda *_: seen)
+    centre = torch.from_numpy((2 * seen[:, 1:] + 1) * 2 / 95 - 1).float()
+    judged = Judged(seen, torus(centre).numpy(), np.array([np.inf]))
+    monkeypatch.setattr(mesher, "judge_blocks", lambda *_: judged)
     assert_same_mesh(mesh_field(torus, 96), want)
 
 

@@ -4,13 +4,17 @@ A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2, the fi
 Cells and blocks are rows [shape, i, j, k]. A cell is judged at its *centre*, the node s / 2 steps above its
 lowest corner, or the grid's last one. Slopes are per grid step: no length of the frame enters.
 
-A cell whose centre has the value f cannot hold the surface while |f| > L * half diagonal, where L bounds the
-slope of the field in it. Nothing about a network guarantees an L: those trained with clamped distances say
-only "far" beyond the clamp, and may be steeper than 1 or nearly flat. So L is measured from the samples
-around the cell, multiplied by a safety factor, and never below what the field shows near its surface. What
-this still misses is grown back: wherever a sign change leaves the evaluated blocks, the neighbour is
-evaluated too. So a connected piece of surface is found whole or not at all.
+A centre with the value f tells the sign of every node of its cell within |f| / L steps, where L bounds the
+slope of the field in the cell; a cell whose nodes are all told is skipped. Of the blocks left, only nodes that
+no block tells are evaluated, and those of cells on which the sign changes. Nothing about a network guarantees
+an L: those trained with clamped distances say only "far" beyond the clamp, and may be steeper than 1 or nearly
+flat. So L is measured from the samples around the cell, multiplied by a safety factor, and never below what
+the field shows near its surface. What this still misses is grown back: wherever a sign change leaves the
+blocks, the neighbour joins them, and a sign that proves wrong has all of them looked at again. So a connected
+piece of surface is found whole or not at all.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -21,11 +25,28 @@ _SMALL = 16  # below this many nodes per axis a coarse level says nothing
 _NEAR = 0.05  # share of the coarse samples, those nearest to zero, that set the least slope
 _CHILDREN = np.indices((1, 2, 2, 2)).reshape(4, 8).T
 _SIDES = [(axis, step) for axis in range(3) for step in (-1, 1)]
-_UNKNOWN, _INSIDE, _OUTSIDE = 0, 1, 2
+_OUTSIDE, _TOLD, _EVALUATED = 1, 2, 4  # what is known of a node, as bits; 0: nothing
 
 
-def candidate_blocks(grid: Grid, coarse: int, safety: float) -> np.ndarray:
-    """Blocks [C, 4] that may hold the surface, those of a shape together.
+class Judged(NamedTuple):
+    """Cells [C, 4] of one stride, the values [C] at their centres and bounds [C] on their slopes."""
+
+    cells: np.ndarray
+    values: np.ndarray
+    slope: np.ndarray
+
+    def candidates(self, stride: int) -> "Judged":
+        """Those that may hold the surface."""
+        keep = ~self.tells(stride * np.sqrt(3) / 2)
+        return Judged(*(array[keep] for array in self))
+
+    def tells(self, distance: float) -> np.ndarray:
+        """Whether [C] nodes of the cell this many steps from its centre have the centre's sign."""
+        return np.abs(self.values) > self.slope * distance
+
+
+def judge_blocks(grid: Grid, coarse: int, safety: float) -> Judged:
+    """The blocks that the coarser levels leave, those of a shape together.
 
     Args:
         grid: of all shapes.
@@ -33,33 +54,55 @@ def candidate_blocks(grid: Grid, coarse: int, safety: float) -> np.ndarray:
         safety: factor on the measured slopes.
     """
     if grid.n <= _SMALL:
-        return _cells(grid, 2)
+        blocks = _cells(grid, 2)
+        return Judged(blocks, grid.evaluate(_centre_keys(grid, blocks, 2)), np.full(len(blocks), np.inf))
     stride = 2 ** max(1, round(np.log2((grid.n - 1) / coarse)))
-    cells, slope = _coarse_cells(grid, stride, safety)
+    judged = _coarse_cells(grid, stride, safety)
     while stride > 2:
+        judged = _refine(grid, judged.candidates(stride), stride // 2, safety)
         stride //= 2
-        cells, slope = _refine(grid, cells, slope, stride, safety)
-    return cells
+    return judged
 
 
-def evaluate_blocks(grid: Grid, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values at the nodes of blocks, which grow until no sign change leaves them.
+def evaluate_crossed(grid: Grid, judged: Judged) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The cells of stride 1 on which the sign changes, and the values at their nodes.
+
+    Args:
+        grid: of all shapes.
+        judged: blocks; those that may hold the surface grow until no sign change leaves them.
 
     Returns:
-        the blocks [C, 4], their nodes' keys [K], each once and in no order, and the values [K] float32.
+        keys [M] of the cells' lowest nodes; keys [K] of nodes, those of the cells among them, each once and
+        in no order; and the values [K] float32.
     """
-    side = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
-    active = np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
-    found = [(blocks[:0], np.empty(0, np.int64), np.empty(0, np.float32))]
+    blocks = judged.candidates(2).cells
+    known, active = _told(grid, judged), np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
+    samples, crossed = [(_centre_keys(grid, judged.cells, 2), judged.values)], [np.empty(0, np.int64)]
     while len(blocks):
         active[tuple(blocks.T)] = True
         nodes = _nodes_of(blocks, grid.n)
-        keys = _distinct(nodes[side[nodes] == _UNKNOWN])
-        values = grid.evaluate(keys)
-        side[keys] = np.where(values > 0, _OUTSIDE, _INSIDE)
-        found.append((blocks, keys, values))
-        blocks = _crossed_neighbours(active, blocks, side[nodes] == _OUTSIDE)
-    return tuple(np.concatenate(arrays) for arrays in zip(*found, strict=True))
+        _evaluate(grid, nodes[known[nodes] == 0], known, samples)
+        cells = _crossed_cells(known[nodes] & _OUTSIDE, blocks, grid.n)
+        if _evaluate(grid, _corners(nodes, cells), known, samples):
+            blocks, crossed = np.argwhere(active), crossed[:1]
+            continue
+        crossed.append(nodes[:, :2, :2, :2][cells])
+        blocks = _crossed_neighbours(active, blocks, (known[nodes] & _OUTSIDE) > 0)
+    keys, values = (np.concatenate(arrays) for arrays in zip(*samples, strict=True))
+    return np.concatenate(crossed), keys, values
+
+
+def _told(grid: Grid, judged: Judged) -> np.ndarray:
+    """What blocks say of all nodes of the grid, flat."""
+    known = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
+    told = (judged.values > 0) * np.int8(_OUTSIDE) | np.int8(_TOLD)
+    columns = _columns_of(judged.cells, grid.n)
+    for squared in (3, 2, 1):
+        sure = judged.tells(np.sqrt(squared))
+        for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared):
+            known[sum(column[sure, at] for column, at in zip(columns, offset, strict=True))] = told[sure]
+    known[_centre_keys(grid, judged.cells, 2)] = (judged.values > 0) * _OUTSIDE | _EVALUATED
+    return known
 
 
 def _cells_per_axis(n: int, stride: int) -> int:
@@ -76,14 +119,14 @@ def _centre_keys(grid: Grid, cells: np.ndarray, stride: int) -> np.ndarray:
     return grid.keys(cells * [1, stride, stride, stride] + [0, *[stride // 2] * 3])
 
 
-def _coarse_cells(grid: Grid, stride: int, safety: float) -> tuple[np.ndarray, np.ndarray]:
-    """The cells [C, 4] of the coarsest level that may hold the surface and their slope bounds [C]."""
+def _coarse_cells(grid: Grid, stride: int, safety: float) -> Judged:
+    """All cells of the coarsest level."""
     m = _cells_per_axis(grid.n, stride)
-    values = grid.evaluate(_centre_keys(grid, _cells(grid, stride), stride)).reshape(-1, m, m, m)
+    cells = _cells(grid, stride)
+    values = grid.evaluate(_centre_keys(grid, cells, stride)).reshape(-1, m, m, m)
     size, slope = np.abs(values), _slope(values, stride)
     bound = safety * np.stack([_least_slope(*pair) for pair in zip(size, slope, strict=True)])
-    keep = _may_cross(size, bound, stride)
-    return np.argwhere(keep), bound[keep]
+    return Judged(cells, values.reshape(-1), bound.reshape(-1))
 
 
 def _least_slope(size: np.ndarray, slope: np.ndarray) -> np.ndarray:
@@ -104,29 +147,55 @@ def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
     return np.sqrt(squares) / spacing
 
 
-def _refine(
-    grid: Grid, cells: np.ndarray, slope: np.ndarray, stride: int, safety: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Those children of the cells that may hold the surface, and their slope bounds; `stride` is theirs."""
-    children = (cells[:, None] * [1, 2, 2, 2] + _CHILDREN).reshape(-1, 4)
+def _refine(grid: Grid, parents: Judged, stride: int, safety: float) -> Judged:
+    """The children of the cells; `stride` is theirs."""
+    children = (parents.cells[:, None] * [1, 2, 2, 2] + _CHILDREN).reshape(-1, 4)
     values = grid.evaluate(_centre_keys(grid, children, stride))
     siblings = _slope(values.reshape(-1, 2, 2, 2), stride).reshape(-1, 8).max(axis=1, initial=0)
-    slope = np.repeat(np.maximum(slope, safety * siblings), 8)
-    inside = (children[:, 1:] * stride < grid.n - 1).all(axis=1)
-    keep = inside & _may_cross(np.abs(values), slope, stride)
-    return children[keep], slope[keep]
+    slope = np.repeat(np.maximum(parents.slope, safety * siblings), 8)
+    within = (children[:, 1:] * stride < grid.n - 1).all(axis=1)
+    return Judged(children[within], values[within], slope[within])
 
 
-def _may_cross(size: np.ndarray, slope: np.ndarray, stride: int) -> np.ndarray:
-    return size <= slope * (stride * np.sqrt(3) / 2)
+def _columns_of(blocks: np.ndarray, n: int) -> list[np.ndarray]:
+    """What each axis adds to the keys of the nodes of blocks, [C, 3] thrice; beyond the grid, its last again."""
+    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3), n - 1) for index in blocks[:, 1:].T)
+    return [(blocks[:, :1] * n + i) * n**2, j * n, k]
 
 
 def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
     """Keys [C, 3, 3, 3] of the nodes of blocks; where a block leaves the grid, its last nodes again."""
-    shape, *ijk = blocks.T
-    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3), n - 1) for index in ijk)
-    plane = (shape[:, None] * n + i)[:, :, None] * n + j[:, None]
-    return plane[..., None] * n + k[:, None, None]
+    i, j, k = _columns_of(blocks, n)
+    return (i[:, :, None] + j[:, None])[..., None] + k[:, None, None]
+
+
+def _evaluate(grid: Grid, keys: np.ndarray, known: np.ndarray, samples: list) -> bool:
+    """Evaluates those nodes that are not yet. Does one prove to be other than it was told?"""
+    keys = _distinct(keys[known[keys] < _EVALUATED])
+    values = grid.evaluate(keys)
+    found = (values > 0) * np.int8(_OUTSIDE) | np.int8(_EVALUATED)
+    wrong = (known[keys] == _TOLD | _OUTSIDE) & (values <= 0) | (known[keys] == _TOLD) & (values > 0)
+    known[keys] = found
+    samples.append((keys, values))
+    return bool(wrong.any())
+
+
+def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
+    """The cells [C, 2, 2, 2] of blocks on which the sign changes, from what is outside [C, 3, 3, 3]."""
+    some = every = outside
+    for axis in (1, 2, 3):
+        low, high = [slice(None)] * axis + [slice(2)], [slice(None)] * axis + [slice(1, 3)]
+        some, every = some[tuple(low)] | some[tuple(high)], every[tuple(low)] & every[tuple(high)]
+    crossed = some != every
+    for axis in (1, 2, 3):
+        np.moveaxis(crossed, axis, 1)[:, 1] &= (2 * blocks[:, axis] + 1 < n - 1)[:, None, None]
+    return crossed
+
+
+def _corners(nodes: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Keys [8 M] of the corners of M marked cells [C, 2, 2, 2] of blocks with nodes [C, 3, 3, 3]."""
+    corners = [nodes[:, a : a + 2, b : b + 2, c : c + 2][cells] for a, b, c in np.ndindex(2, 2, 2)]
+    return np.concatenate(corners)
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:

@@ -28,48 +28,40 @@ def march(volume: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarra
     return vertices, faces
 
 
-def march_blocks(
-    blocks: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int
+def march_cells(
+    cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes over the cells of some blocks, one slab of x at a time, joined to one mesh.
+    """Marching cubes over some cells, one slab of x at a time, joined to one mesh.
 
     Args:
-        blocks: [C, 3]; block b covers the cells 2b and 2b + 1 of each axis that the grid has.
-        nodes: [K] flat indices of nodes, x slowest; all nodes of the blocks are among them.
+        cells: [M] flat indices of the cells' lowest nodes, x slowest.
+        nodes: [K] flat indices of nodes; all corners of the cells are among them.
         values: [K] float32 at the nodes.
         n: nodes per axis.
     """
-    if not len(blocks):
+    if not len(cells):
         return march(np.ones((2, 2, 2), np.float32))
-    low = 2 * blocks.min(axis=0)  # only the box of the blocks is looked at
-    high = np.minimum(2 * blocks.max(axis=0) + 2, n - 1)
-    across = high[1:] - low[1:] + 1
-    area = int(across.prod())
-    depth = max(2, SLAB_NODES // area // 2 * 2)
-    i, j, k = (index - lowest for index, lowest in zip(np.unravel_index(nodes, (n,) * 3), low, strict=True))
-    places = (i * across[0] + j) * across[1] + k
+    cells, nodes = (np.stack(np.unravel_index(keys, (n,) * 3)) for keys in (cells, nodes))
+    low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is looked at
+    within = ((nodes >= low[:, None]) & (nodes <= high[:, None])).all(axis=0)
+    size, values = high - low + 1, values[within]
+    strides = np.array([size[1] * size[2], size[2], 1])
+    uppers, places = strides @ (cells - low[:, None] + 1), strides @ (nodes[:, within] - low[:, None])
+    depth = max(2, SLAB_NODES // strides[0])
     parts, count = [], 0
-    for start in range(0, high[0] - low[0], depth):
-        stop = min(start + depth, high[0] - low[0])
-        inside = (places >= start * area) & (places < (stop + 1) * area)
-        volume = np.ones((stop - start + 1, *across), np.float32)
-        volume.reshape(-1)[places[inside] - start * area] = values[inside]
-        vertices, faces = march(volume, _mask(2 * blocks - low - [start, 0, 0], volume.shape))
+    for start in range(0, size[0] - 1, depth):
+        shape = min(depth, size[0] - 1 - start) + 1, *size[1:]
+        volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)
+        for array, at, content in ((volume, places, values), (mask, uppers, True)):
+            held = (at >= start * strides[0]) & (at < (start + shape[0]) * strides[0])
+            array.reshape(-1)[at[held] - start * strides[0]] = content if content is True else content[held]
+        mask[0] = False  # cells of the slab before
+        vertices, faces = march(volume, mask)
         parts.append((vertices + np.float32([start, 0, 0]), faces + count))
         count += len(vertices)
     vertices, faces = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     vertices, faces = _weld(vertices, faces, depth) if len(parts) > 1 else (vertices, faces)
     return vertices + low.astype(np.float32), faces
-
-
-def _mask(low: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The upper corners of the cells of blocks with first cells `low` [C, 3], as far as `shape` has them."""
-    halves = np.zeros([-(-(size - 1) // 2) for size in shape], bool)
-    halves[tuple((low[(low[:, 0] >= 0) & (low[:, 0] < shape[0] - 1)] // 2).T)] = True
-    mask = np.zeros(shape, bool)
-    cells = halves.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    mask[1:, 1:, 1:] = cells[tuple(slice(size - 1) for size in shape)]
-    return mask
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from sdfhub.geometry.coarse_to_fine import candidate_blocks, evaluate_blocks
+from sdfhub.geometry.coarse_to_fine import evaluate_crossed, judge_blocks
 from sdfhub.geometry.grid import Fields, Grid
-from sdfhub.geometry.marching import march, march_blocks
+from sdfhub.geometry.marching import march, march_cells
 
 Field = Callable[[torch.Tensor], torch.Tensor]
 """Maps points [N, 3] float32, normalised frame, to signed distances [N], negative inside."""
@@ -58,12 +58,11 @@ def mesh_fields(
     for first in range(0, shapes, together):
         group = range(first, min(first + together, shapes))
         grid = _grid(fields, group, resolution, bound, batch, device)
-        blocks, keys, values = evaluate_blocks(grid, candidate_blocks(grid, coarse, safety))
-        shape_of_key = keys // resolution**3
+        cells, keys, values = evaluate_crossed(grid, judge_blocks(grid, coarse, safety))
+        of_cell, of_key = cells // resolution**3, keys // resolution**3
         for shape in range(len(group)):
-            own, held = blocks[blocks[:, 0] == shape, 1:], shape_of_key == shape
-            nodes = keys[held] - shape * resolution**3
-            yield grid.to_frame(*march_blocks(own, nodes, values[held], resolution))
+            own, held, first = cells[of_cell == shape], of_key == shape, shape * resolution**3
+            yield grid.to_frame(*march_cells(own - first, keys[held] - first, values[held], resolution))
 
 
 def mesh_field(
