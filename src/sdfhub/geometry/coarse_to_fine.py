@@ -5,13 +5,13 @@ Cells and blocks are rows [shape, i, j, k]. A cell is judged at its *centre*, th
 lowest corner, or the grid's last one. Slopes are per grid step: no length of the frame enters.
 
 A centre with the value f tells the sign of every node of its cell within |f| / L steps, where L bounds the
-slope of the field in the cell; a cell whose nodes are all told is skipped. Of the blocks left, only nodes that
-no block tells are evaluated, and those of cells on which the sign changes. Nothing about a network guarantees
-an L: those trained with clamped distances say only "far" beyond the clamp, and may be steeper than 1 or nearly
-flat. So L is measured from the samples around the cell, multiplied by a safety factor, and never below what
-the field shows near its surface. What this still misses is grown back: wherever a sign change leaves the
-blocks, the neighbour joins them, and a sign that proves wrong has all of them looked at again. So a connected
-piece of surface is found whole or not at all.
+slope of the field in the cell; a cell whose nodes are all told is skipped. Of the blocks left, only nodes
+that no block tells are evaluated, and those of cells on which the sign changes. Nothing about a network
+guarantees an L: those trained with clamped distances say only "far" beyond the clamp, and may be steeper than
+1 or nearly flat. So L is measured from the samples around the cell, multiplied by a safety factor, and never
+below what the field shows near its surface. What this still misses is grown back: wherever a sign change
+leaves the blocks, the neighbour joins them, and when a told sign proves wrong, all are looked at again. So a
+connected piece of surface is found whole or not at all.
 """
 
 from typing import NamedTuple
@@ -78,31 +78,41 @@ def evaluate_crossed(grid: Grid, judged: Judged) -> tuple[np.ndarray, np.ndarray
     blocks = judged.candidates(2).cells
     known, active = _told(grid, judged), np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
     samples, crossed = [(_centre_keys(grid, judged.cells, 2), judged.values)], [np.empty(0, np.int64)]
+    known[samples[0][0]] = _evaluated(judged.values)
     while len(blocks):
         active[tuple(blocks.T)] = True
         nodes = _nodes_of(blocks, grid.n)
         _evaluate(grid, nodes[known[nodes] == 0], known, samples)
-        cells = _crossed_cells(known[nodes] & _OUTSIDE, blocks, grid.n)
-        if _evaluate(grid, _corners(nodes, cells), known, samples):
+        outside = (known[nodes] & _OUTSIDE) > 0
+        marks = _crossed_cells(outside, blocks, grid.n)
+        cells, surface = nodes[:, :2, :2, :2][marks], marks.any(axis=(1, 2, 3))
+        corners = np.concatenate([cells + corner @ _strides(grid.n) for corner in _CHILDREN[:, 1:]])
+        if _evaluate(grid, corners, known, samples):
             blocks, crossed = np.argwhere(active), crossed[:1]
-            continue
-        crossed.append(nodes[:, :2, :2, :2][cells])
-        blocks = _crossed_neighbours(active, blocks, (known[nodes] & _OUTSIDE) > 0)
+        else:
+            blocks = _crossed_neighbours(active, blocks[surface], outside[surface])
+            crossed.append(cells)
     keys, values = (np.concatenate(arrays) for arrays in zip(*samples, strict=True))
     return np.concatenate(crossed), keys, values
 
 
 def _told(grid: Grid, judged: Judged) -> np.ndarray:
-    """What blocks say of all nodes of the grid, flat."""
+    """What blocks say of all nodes of the grid, flat; those that leave the grid say nothing."""
     known = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
-    told = (judged.values > 0) * np.int8(_OUTSIDE) | np.int8(_TOLD)
-    columns = _columns_of(judged.cells, grid.n)
+    within = (2 * judged.cells[:, 1:] + 2 < grid.n).all(axis=1)
+    judged = Judged(*(array[within] for array in judged))
+    centres, told = _centre_keys(grid, judged.cells, 2), np.where(judged.values > 0, _TOLD | _OUTSIDE, _TOLD)
     for squared in (3, 2, 1):
         sure = judged.tells(np.sqrt(squared))
-        for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared):
-            known[sum(column[sure, at] for column, at in zip(columns, offset, strict=True))] = told[sure]
-    known[_centre_keys(grid, judged.cells, 2)] = (judged.values > 0) * _OUTSIDE | _EVALUATED
+        near, signs = centres[sure], told[sure].astype(np.int8)
+        for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared) - 1:
+            known[near + offset @ _strides(grid.n)] = signs
     return known
+
+
+def _strides(n: int) -> np.ndarray:
+    """What one step along each axis adds to a key."""
+    return np.array([n * n, n, 1])
 
 
 def _cells_per_axis(n: int, stride: int) -> int:
@@ -157,27 +167,27 @@ def _refine(grid: Grid, parents: Judged, stride: int, safety: float) -> Judged:
     return Judged(children[within], values[within], slope[within])
 
 
-def _columns_of(blocks: np.ndarray, n: int) -> list[np.ndarray]:
-    """What each axis adds to the keys of the nodes of blocks, [C, 3] thrice; beyond the grid, its last again."""
-    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3), n - 1) for index in blocks[:, 1:].T)
-    return [(blocks[:, :1] * n + i) * n**2, j * n, k]
-
-
 def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
     """Keys [C, 3, 3, 3] of the nodes of blocks; where a block leaves the grid, its last nodes again."""
-    i, j, k = _columns_of(blocks, n)
-    return (i[:, :, None] + j[:, None])[..., None] + k[:, None, None]
+    shape, *ijk = blocks.T
+    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3), n - 1) for index in ijk)
+    plane = (shape[:, None] * n + i)[:, :, None] * n + j[:, None]
+    return (plane * n)[..., None] + k[:, None, None]
 
 
 def _evaluate(grid: Grid, keys: np.ndarray, known: np.ndarray, samples: list) -> bool:
     """Evaluates those nodes that are not yet. Does one prove to be other than it was told?"""
     keys = _distinct(keys[known[keys] < _EVALUATED])
     values = grid.evaluate(keys)
-    found = (values > 0) * np.int8(_OUTSIDE) | np.int8(_EVALUATED)
-    wrong = (known[keys] == _TOLD | _OUTSIDE) & (values <= 0) | (known[keys] == _TOLD) & (values > 0)
-    known[keys] = found
+    before, after = known[keys], _evaluated(values)
+    known[keys] = after
     samples.append((keys, values))
-    return bool(wrong.any())
+    return bool(((before != 0) & ((before ^ after) & _OUTSIDE > 0)).any())
+
+
+def _evaluated(values: np.ndarray) -> np.ndarray:
+    """What values say of their nodes."""
+    return np.where(values > 0, _EVALUATED | _OUTSIDE, _EVALUATED).astype(np.int8)
 
 
 def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
@@ -190,12 +200,6 @@ def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarra
     for axis in (1, 2, 3):
         np.moveaxis(crossed, axis, 1)[:, 1] &= (2 * blocks[:, axis] + 1 < n - 1)[:, None, None]
     return crossed
-
-
-def _corners(nodes: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Keys [8 M] of the corners of M marked cells [C, 2, 2, 2] of blocks with nodes [C, 3, 3, 3]."""
-    corners = [nodes[:, a : a + 2, b : b + 2, c : c + 2][cells] for a, b, c in np.ndindex(2, 2, 2)]
-    return np.concatenate(corners)
 
 
 def _distinct(keys: np.ndarray) -> np.ndarray:

@@ -11,21 +11,11 @@ SLAB_NODES = 2**24
 """Nodes marched at a time: 64 MiB of values, whatever the resolution."""
 
 
-def march(volume: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and outward faces; empty where nothing crosses zero.
-
-    Args:
-        volume: [a, b, c] float32.
-        mask: bool, like `volume`: cells to march, each marked at its upper corner; None marches all.
-    """
-    empty = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
+def march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and outward faces of [a, b, c] float32; empty where nothing crosses zero."""
     if not volume.min() <= 0 < volume.max():
-        return empty
-    try:
-        vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask)
-    except RuntimeError:  # both signs occur, but in no marched cell together
-        return empty
-    return vertices, faces
+        return np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
+    return marching_cubes(volume, 0.0)[:2]
 
 
 def march_cells(
@@ -34,16 +24,16 @@ def march_cells(
     """Marching cubes over some cells, one slab of x at a time, joined to one mesh.
 
     Args:
-        cells: [M] flat indices of the cells' lowest nodes, x slowest.
+        cells: [M] flat indices of the lowest nodes of cells on which the sign changes, x slowest.
         nodes: [K] flat indices of nodes; all corners of the cells are among them.
         values: [K] float32 at the nodes.
         n: nodes per axis.
     """
     if not len(cells):
         return march(np.ones((2, 2, 2), np.float32))
-    cells, nodes = (np.stack(np.unravel_index(keys, (n,) * 3)) for keys in (cells, nodes))
+    cells, nodes = _indices(cells, n), _indices(nodes, n)
     low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is looked at
-    within = ((nodes >= low[:, None]) & (nodes <= high[:, None])).all(axis=0)
+    within = np.logical_and.reduce((nodes >= low[:, None]) & (nodes <= high[:, None]))
     size, values = high - low + 1, values[within]
     strides = np.array([size[1] * size[2], size[2], 1])
     uppers, places = strides @ (cells - low[:, None] + 1), strides @ (nodes[:, within] - low[:, None])
@@ -51,17 +41,26 @@ def march_cells(
     parts, count = [], 0
     for start in range(0, size[0] - 1, depth):
         shape = min(depth, size[0] - 1 - start) + 1, *size[1:]
-        volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)
+        volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)  # a cell's mark: its upper corner
         for array, at, content in ((volume, places, values), (mask, uppers, True)):
             held = (at >= start * strides[0]) & (at < (start + shape[0]) * strides[0])
             array.reshape(-1)[at[held] - start * strides[0]] = content if content is True else content[held]
         mask[0] = False  # cells of the slab before
-        vertices, faces = march(volume, mask)
+        if not mask.any():
+            continue
+        vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask)
         parts.append((vertices + np.float32([start, 0, 0]), faces + count))
         count += len(vertices)
     vertices, faces = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     vertices, faces = _weld(vertices, faces, depth) if len(parts) > 1 else (vertices, faces)
     return vertices + low.astype(np.float32), faces
+
+
+def _indices(keys: np.ndarray, n: int) -> np.ndarray:
+    """Indices [3, N] of nodes by their flat ones; `np.unravel_index` is several times slower."""
+    columns = keys // n
+    i = columns // n
+    return np.stack([i, columns - i * n, keys - columns * n])
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
