@@ -77,7 +77,7 @@ def evaluate_crossed(grid: Grid, judged: Judged) -> tuple[np.ndarray, np.ndarray
     """
     blocks = judged.candidates(2).cells
     known, active = _told(grid, judged), np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
-    samples, crossed = [(_centre_keys(grid, judged.cells, 2), judged.values)], [np.empty(0, np.int64)]
+    samples, crossed = [(_centre_keys(grid, judged.cells, 2), judged.values)], [np.empty(0, grid.integers)]
     known[samples[0][0]] = _evaluated(judged.values)
     while len(blocks):
         active[tuple(blocks.T)] = True
@@ -86,9 +86,9 @@ def evaluate_crossed(grid: Grid, judged: Judged) -> tuple[np.ndarray, np.ndarray
         outside = (known[nodes] & _OUTSIDE) > 0
         marks = _crossed_cells(outside, blocks, grid.n)
         cells, surface = nodes[:, :2, :2, :2][marks], marks.any(axis=(1, 2, 3))
-        corners = np.concatenate([cells + corner @ _strides(grid.n) for corner in _CHILDREN[:, 1:]])
+        corners = np.concatenate([cells + _distance(corner, grid.n) for corner in _CHILDREN[:, 1:]])
         if _evaluate(grid, corners, known, samples):
-            blocks, crossed = np.argwhere(active), crossed[:1]
+            blocks, crossed = np.argwhere(active).astype(grid.integers), crossed[:1]
         else:
             blocks = _crossed_neighbours(active, blocks[surface], outside[surface])
             crossed.append(cells)
@@ -106,13 +106,13 @@ def _told(grid: Grid, judged: Judged) -> np.ndarray:
         sure = judged.tells(np.sqrt(squared))
         near, signs = centres[sure], told[sure].astype(np.int8)
         for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared) - 1:
-            known[near + offset @ _strides(grid.n)] = signs
+            known[near + _distance(offset, grid.n)] = signs
     return known
 
 
-def _strides(n: int) -> np.ndarray:
-    """What one step along each axis adds to a key."""
-    return np.array([n * n, n, 1])
+def _distance(offset: np.ndarray, n: int) -> int:
+    """What steps [3] along the axes add to a key."""
+    return int(offset @ [n * n, n, 1])
 
 
 def _cells_per_axis(n: int, stride: int) -> int:
@@ -122,11 +122,13 @@ def _cells_per_axis(n: int, stride: int) -> int:
 def _cells(grid: Grid, stride: int) -> np.ndarray:
     """All cells [C, 4] of a stride."""
     sizes = len(grid.shapes), *[_cells_per_axis(grid.n, stride)] * 3
-    return np.indices(sizes).reshape(4, -1).T
+    return np.indices(sizes, grid.integers).reshape(4, -1).T
 
 
 def _centre_keys(grid: Grid, cells: np.ndarray, stride: int) -> np.ndarray:
-    return grid.keys(cells * [1, stride, stride, stride] + [0, *[stride // 2] * 3])
+    shape, *ijk = cells.T
+    i, j, k = (np.minimum(index * stride + stride // 2, grid.n - 1) for index in ijk)
+    return ((shape * grid.n + i) * grid.n + j) * grid.n + k
 
 
 def _coarse_cells(grid: Grid, stride: int, safety: float) -> Judged:
@@ -159,7 +161,8 @@ def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
 
 def _refine(grid: Grid, parents: Judged, stride: int, safety: float) -> Judged:
     """The children of the cells; `stride` is theirs."""
-    children = (parents.cells[:, None] * [1, 2, 2, 2] + _CHILDREN).reshape(-1, 4)
+    first = parents.cells * np.array([1, 2, 2, 2], grid.integers)
+    children = (first[:, None] + _CHILDREN.astype(grid.integers)).reshape(-1, 4)
     values = grid.evaluate(_centre_keys(grid, children, stride))
     siblings = _slope(values.reshape(-1, 2, 2, 2), stride).reshape(-1, 8).max(axis=1, initial=0)
     slope = np.repeat(np.maximum(parents.slope, safety * siblings), 8)
@@ -170,7 +173,7 @@ def _refine(grid: Grid, parents: Judged, stride: int, safety: float) -> Judged:
 def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
     """Keys [C, 3, 3, 3] of the nodes of blocks; where a block leaves the grid, its last nodes again."""
     shape, *ijk = blocks.T
-    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3), n - 1) for index in ijk)
+    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3, dtype=index.dtype), n - 1) for index in ijk)
     plane = (shape[:, None] * n + i)[:, :, None] * n + j[:, None]
     return (plane * n)[..., None] + k[:, None, None]
 

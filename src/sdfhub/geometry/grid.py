@@ -55,11 +55,10 @@ class Grid:
         steps = torch.arange(self.n, dtype=torch.float64)
         return (steps * self.step - self.bound).float().to(self.device)
 
-    def keys(self, nodes: np.ndarray) -> np.ndarray:
-        """Flat keys [N] of nodes [N, 4]: shape, i, j, k; those beyond the end of an axis are its last."""
-        shape, *ijk = nodes.T
-        i, j, k = np.minimum(ijk, self.n - 1)
-        return ((shape * self.n + i) * self.n + j) * self.n + k
+    @property
+    def integers(self) -> type:
+        """The smallest type that holds all keys: half the memory is most of the time spent on them."""
+        return np.int32 if len(self.shapes) * self.n**3 < 2**31 else np.int64
 
     def evaluate(self, keys: np.ndarray) -> np.ndarray:
         """The fields [N] float32 at the nodes of keys [N]: a shape's together, shapes in order."""
