@@ -128,7 +128,7 @@ def compared(name: str, model: AutoDecoder, resolution: int, shapes: int) -> str
     return f"| {name} | {cells} | {fewer.min():.1f} | {np.median(fewer):.1f} |"
 
 
-def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes: int, peak: str) -> str:
+def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes: int) -> str:
     """A line of the second table."""
     dense_seconds, seconds, share, fewer = [], [], [], []
     for shape in range(shapes):
@@ -141,7 +141,7 @@ def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes:
     ratio = min(dense_seconds) / np.array(seconds)
     cells = [f"{min(dense_seconds):.1f}", f"{np.median(seconds):.2f}", f"{ratio.min():.1f}"]
     cells += [f"{np.median(ratio):.1f}", f"{min(fewer):.1f}", f"{np.median(fewer):.1f}"]
-    return f"| {name} | {shapes} | {' | '.join(cells)} | {np.median(share):.0%} | {peak} |"
+    return f"| {name} | {shapes} | {' | '.join(cells)} | {np.median(share):.0%} |"
 
 
 def together(model: AutoDecoder, resolution: int, shapes: int) -> str:
@@ -171,7 +171,7 @@ def peak_memory(name: str, shapes: int) -> None:
 def peak_elsewhere(name: str, shapes: int) -> str:
     command = [sys.executable, __file__, "--peak", name, "--shapes", str(shapes)]
     loaded, peak = subprocess.check_output(command, text=True).split()[-2:]
-    return f"{peak} ({loaded})"
+    return f"{name}, shape 0 at 512^3: at most {peak} MiB, of them {loaded} before meshing"
 
 
 def main() -> None:
@@ -200,12 +200,11 @@ def main() -> None:
             print(compared(name, model, arguments.compare, some), flush=True)
     if arguments.only != "compared":
         timings = "shapes, dense s, ours s, ratio min, median, fewer evaluations min, median"
-        print(head(f"space, {timings}, time in the field, MiB at 512^3 (loaded)"))
+        print(head(f"space, {timings}, time in the field"))
         for name in [name for name in CATEGORIES if name in models]:
-            peak = peak_elsewhere(name, shapes)
-            print(measured(name, models[name], 256, arguments.dense, shapes, peak), flush=True)
-        for resolution in (64, 256):
-            print(together(models[min(models)], resolution, 4))
+            print(measured(name, models[name], 256, arguments.dense, shapes), flush=True)
+        first = min(models)
+        print(f"\n{together(models[first], 64, 4)}\n{peak_elsewhere(first, shapes)}")
 
 
 if __name__ == "__main__":
