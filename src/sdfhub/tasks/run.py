@@ -74,7 +74,9 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> Auto
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
         steps=steps,
-        computing=build(config["computing"], "computing", within="sdfhub.model"),
+        computing=build(config["computing"], "computing", within="sdfhub.model")
+        if "computing" in config
+        else None,
         seed=config["seed"],
     )
 
