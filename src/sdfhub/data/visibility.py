@@ -25,8 +25,8 @@ FIRST, SECOND = 16, 48
 """Rays at every face, and at those that the first ones leave open."""
 RAYS = 1_500_000
 """Rays of a round above which a face gets fewer than that, down to half."""
-LARGE = 200_000
-"""Rays of a round on top, shared out by area."""
+LARGE, AGAIN = 200_000, 3
+"""Rays of the first round on top, shared out by area; a face gets this many times as many in the second."""
 SURE = 0.12
 """Share of its rays that must reach a face, all on one side, to need no others (an open side has 0.5)."""
 CHUNK = 50_000
@@ -105,7 +105,7 @@ def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sig
     watch.look(np.arange(len(large)), large + _fair(len(large), FIRST))
     again = np.flatnonzero(_is_open(*watch.sums))
     if len(again):
-        watch.look(again, large[again] + _fair(len(again), SECOND))
+        watch.look(again, AGAIN * large[again] + _fair(len(again), SECOND))
     return Sightings(*(watch.sums[:2] / np.maximum(watch.sums[2], 1e-12)))
 
 
