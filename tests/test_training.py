@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.data.batches import Augmentation, Loading, StepBatches, wrapping_slice
+from sdfhub.data.batches import Augmentation, Loading, StepBatches, random_rows
 from sdfhub.data.datamodule import EpochSteps
 from sdfhub.errors import SdfhubError
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
@@ -107,12 +107,13 @@ def test_each_group_has_its_own_learning_rate():
     }
 
 
-def test_wrapping_slice_reaches_every_row_equally():
-    array, rng = np.arange(10)[:, None], np.random.default_rng(0)
-    drawn = np.concatenate([wrapping_slice(array, 4, rng) for _ in range(5000)])[:, 0]
+def test_random_rows_reach_every_row_equally():
+    shape, rng = FakeShape(0.5), np.random.default_rng(0)
+    shape.inside = np.arange(10)[:, None]
+    drawn = np.concatenate([random_rows(shape, "inside", 4, rng) for _ in range(5000)])[:, 0]
     assert np.bincount(drawn, minlength=10).std() < 60
-    assert len(wrapping_slice(array, 25, rng)) == 25
-    assert wrapping_slice(array, 0, rng).shape == (0, 1)
+    assert len(random_rows(shape, "inside", 25, rng)) == 25
+    assert random_rows(shape, "inside", 0, rng).shape == (0, 1)
 
 
 def test_a_batch_is_a_function_of_seed_and_step():

@@ -154,19 +154,3 @@ def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Genera
     """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
     start = int(rng.integers(shape.rows(name))) if count else 0
     return shape.read(name, start, count)
-
-
-def wrapping_slice(array: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """`count` consecutive rows from a random start, going on at the first row after the last.
-
-    Args:
-        array: [R, C], pre-shuffled, R >= 1 unless count is 0.
-        count: rows wanted; may exceed R.
-        rng: draws the start.
-    """
-    if count == 0:
-        return np.empty((0, array.shape[1]), array.dtype)
-    start = int(rng.integers(len(array)))
-    if start + count <= len(array):
-        return np.array(array[start : start + count])
-    return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.batches import signed_samples, wrapping_slice
+from sdfhub.data.batches import random_rows, signed_samples
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
@@ -184,8 +184,8 @@ def distance_errors(
         samples on the right side.
     """
     rng = np.random.default_rng(0)
-    sides = [array for array in (shape.outside, shape.inside) if len(array)]
-    drawn = np.concatenate([wrapping_slice(side, min(len(side), 100_000), rng) for side in sides])
+    sides = [(name, min(shape.rows(name), 100_000)) for name in ("outside", "inside")]
+    drawn = np.concatenate([random_rows(shape, name, count, rng) for name, count in sides])
     rows = torch.from_numpy(drawn).to(code.device)
     field = torch.cat([decoder(part[None, :, :3], code[None])[0] for part in rows.split(BATCH)])
     near = rows[:, 3].abs() < delta
