@@ -27,6 +27,7 @@ from torch import nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
+from sdfhub.model.computing import keep_freed_memory
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.run import build_autodecoder
@@ -144,7 +145,7 @@ class OurStep:
         self.step += 1
 
     def operations(self) -> float:
-        """Multiplications and additions of matrix products in a step."""
+        """Multiplications and additions of the matrix products that a step makes."""
         loading = self.batches.loading
         # forward and two products backward; the written-out gradient is as much again
         points = 3 * (loading.samples_per_shape + 2 * loading.surface_per_shape)
@@ -232,6 +233,7 @@ def main() -> None:
     if args.threads:
         torch.set_num_threads(args.threads)
     register_resolvers()
+    keep_freed_memory()  # for the reference too
     torch.manual_seed(0)
     with (
         tempfile.TemporaryDirectory() as folder,

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
-from sdfhub.model.activations import Hosc, Relu, Siren
+from sdfhub.model.activations import Hosc, Relu, Siren, joined
 from sdfhub.model.computing import Computing
 from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Fourier
@@ -63,6 +63,24 @@ def test_loops_equal_autograd_through_the_plain_formula(activation, per_shape, p
         ):  # no further from the truth than the plain formula
             size, allowed = want.abs().max(), (rival - want).abs().max()
             assert (have - want).abs().max() <= 4 * allowed + 2e-6 * size
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["fp32", "bf16"])
+def test_what_is_written_beside_an_activation_equals_what_is_joined_to_it(activation, dtype):
+    product, shift = products()
+    product = product.detach().to(dtype).requires_grad_()
+    beside = torch.randn(3, 300, 5, requires_grad=True)
+    inputs = [product, shift, beside]
+    for shifted in (activation.shifted, lambda *args: activation.shifted_with_slope(*args)[0]):
+        together, apart = shifted(product, shift, beside), joined(shifted(product, shift), beside)
+        by = torch.randn_like(together)
+        for one, other in zip(
+            [together, *torch.autograd.grad(together, inputs, by)],
+            [apart, *torch.autograd.grad(apart, inputs, by)],
+            strict=True,
+        ):
+            assert one.dtype == other.dtype and torch.equal(one, other)
 
 
 def test_the_polynomials_of_the_loops_are_good_to_a_millionth():
@@ -220,7 +238,7 @@ def test_computing_takes_what_suits_the_device():
     with pytest.raises(ValueError, match="at least 1"):
         Computing(points_at_once=0)
     try:
-        Computing(matmul="medium").set_matmul(cpu)
+        Computing(matmul="medium").set_up(cpu)
         assert torch.get_float32_matmul_precision() == "medium"
     finally:
         torch.set_float32_matmul_precision("highest")

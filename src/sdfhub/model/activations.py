@@ -15,6 +15,11 @@ from torch import Tensor, nn
 from sdfhub.model.waves import Wave, fits
 
 
+def joined(hidden: Tensor, beside: Tensor | None) -> Tensor:
+    """[hidden | beside], [B, N, W + F] with the dtype of `hidden`, which alone is returned for None."""
+    return hidden if beside is None else torch.cat([hidden, beside.to(hidden.dtype)], dim=-1)
+
+
 class Activation(nn.Module, ABC):
     """An elementwise nonlinearity that knows how the layer before it must be initialised.
 
@@ -30,14 +35,22 @@ class Activation(nn.Module, ABC):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """a(x) and a'(x), both shaped like x and both differentiable."""
 
-    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
-        """a(product + shift) [B, N, W] with the dtype of `product`; shift [W] or [B, 1, W] float32."""
-        return self(product + shift).to(product.dtype)
+    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
+        """[a(product + shift) | beside], [B, N, W + F] with the dtype of `product`.
 
-    def shifted_with_slope(self, product: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """a(product + shift) and a'(product + shift), as `shifted`."""
+        Args:
+            product: [B, N, W].
+            shift: [W] or [B, 1, W] float32.
+            beside: [B, N, F], what the next layer reads beside this one; None for nothing, F = 0.
+        """
+        return joined(self(product + shift).to(product.dtype), beside)
+
+    def shifted_with_slope(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """As `shifted`, and a'(product + shift) [B, N, W]."""
         value, slope = self.with_slope(product + shift)
-        return value.to(product.dtype), slope.to(product.dtype)
+        return joined(value.to(product.dtype), beside), slope.to(product.dtype)
 
     @abstractmethod
     def weight_bound(self, fan_in: int) -> float:
@@ -60,8 +73,9 @@ class Relu(Activation):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return torch.relu(x), (x > 0).to(x.dtype)
 
-    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
-        return self(product + shift.to(product.dtype))  # rounds as often as a cast of the result would
+    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
+        # rounds as often as a cast of the result would
+        return joined(torch.relu_(product + shift.to(product.dtype)), beside)
 
 
 class Siren(Activation):
@@ -92,15 +106,17 @@ class Siren(Activation):
         angle = self.omega * x
         return torch.sin(angle), self.omega * torch.cos(angle)
 
-    def shifted(self, product: Tensor, shift: Tensor) -> Tensor:
+    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
         if not fits(product):
-            return super().shifted(product, shift)
-        return Wave.apply(product, shift, self.log_beta, self.omega, self.with_slope, False)
+            return super().shifted(product, shift, beside)
+        return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, False)
 
-    def shifted_with_slope(self, product: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    def shifted_with_slope(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         if not fits(product):
-            return super().shifted_with_slope(product, shift)
-        return Wave.apply(product, shift, self.log_beta, self.omega, self.with_slope, True)
+            return super().shifted_with_slope(product, shift, beside)
+        return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, True)
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega}

@@ -55,7 +55,7 @@ class AutoDecoder(L.LightningModule):
         return self.decoder(points, self.codes(rows))
 
     def on_fit_start(self) -> None:
-        self.computing.set_matmul(self.device)
+        self.computing.set_up(self.device)
         self._value = self.computing.compiled(self.decoder.forward, self.device)
         self._value_and_gradient = self.computing.compiled(self.decoder.value_and_gradient, self.device)
 

@@ -1,5 +1,6 @@
 """How a step is computed on the machine at hand: choices of speed and memory, not of what is learned."""
 
+import ctypes
 import os
 import shutil
 from collections.abc import Callable
@@ -10,6 +11,9 @@ import torch
 
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 """Samples worked on together: what stays near a processor's caches; what fills a GPU and not its memory."""
+
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of options in glibc's malloc.h
 
 
 @dataclass(frozen=True)
@@ -36,9 +40,10 @@ class Computing:
         """Samples worked on together on this device."""
         return self.points_at_once or TOGETHER.get(device.type, TOGETHER["cuda"])
 
-    def set_matmul(self, device: torch.device) -> None:
-        """Sets the precision of this process's products."""
+    def set_up(self, device: torch.device) -> None:
+        """Sets the precision of this process's products, and keeps the memory it frees."""
         torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
+        keep_freed_memory()
 
     def compiled(self, function: Callable, device: torch.device) -> Callable:
         """The function itself, or what `torch.compile` makes of it on this device."""
@@ -46,3 +51,16 @@ class Computing:
         if wanted is None:
             wanted = device.type == "cuda" and shutil.which(os.environ.get("CC", "cc")) is not None
         return torch.compile(function) if wanted else function
+
+
+def keep_freed_memory() -> None:
+    """Lets this process keep blocks it has freed, up to a GiB, where the C library is glibc.
+
+    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step.
+    """
+    try:
+        set_option = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+    for option in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
+        set_option(option, 2**30)

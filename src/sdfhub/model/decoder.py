@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
-from sdfhub.model.activations import Activation
+from sdfhub.model.activations import Activation, joined
 from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Encoding
 
@@ -30,16 +30,14 @@ class Layer(nn.Module):
         self.columns = [hidden, encoding, code]
         self.linear = nn.Linear(sum(self.columns), outputs)
 
-    def forward(self, hidden: Tensor | None, encoded: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
         """Product [B, N, outputs] and the shift [B, 1, outputs] or [outputs] that is to be added to it.
 
         Args:
-            hidden: [B, N, H]; None in layer 0.
-            encoded: [B, N, F]; codes: [B, L].
+            inputs: [B, N, H + F], hidden features and encoded points.
+            codes: [B, L].
         """
         from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
-        read = [part for part, columns in zip((hidden, encoded), self.columns, strict=False) if columns]
-        inputs = read[0] if len(read) == 1 else torch.cat([part.to(hidden.dtype) for part in read], dim=-1)
         shift = self.linear.bias
         if self.columns[2]:
             with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
@@ -130,16 +128,20 @@ class Decoder(nn.Module):
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
         encoded = self.encoding(points)
-        hidden = None
-        for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden = activation.shifted(*layer(hidden, encoded, codes))
-            if self.dropout and self.training:
-                hidden = hidden * kept(hidden, self.dropout)
-        return self._head(hidden, encoded, codes)
+        inputs, drops = encoded, self.dropout and self.training
+        for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
+            product, shift = layer(inputs, codes)
+            beside = encoded if following.columns[1] else None
+            if drops:
+                hidden = activation.shifted(product, shift)
+                inputs = joined(hidden * kept(hidden, self.dropout), beside)
+            else:
+                inputs = activation.shifted(product, shift, beside)
+        return self._head(inputs, encoded, codes)
 
-    def _head(self, hidden: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
-        with torch.autocast(hidden.device.type, enabled=False):  # a distance deserves all its digits
-            product, shift = self.layers[-1](hidden.to(encoded.dtype), encoded, codes)
+    def _head(self, inputs: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
+        with torch.autocast(inputs.device.type, enabled=False):  # a distance deserves all its digits
+            product, shift = self.layers[-1](inputs.to(encoded.dtype), codes)
         sdf = (product + shift).squeeze(-1)
         return torch.tanh(sdf) if self.tanh else sdf
 
@@ -154,14 +156,18 @@ class Decoder(nn.Module):
             codes: [B, L].
         """
         encoded, to_space = self.encoding.with_pullback(points)
-        hidden, slopes = None, []
-        for layer, activation in zip(self.layers, self.activations, strict=False):
-            hidden, slope = activation.shifted_with_slope(*layer(hidden, encoded, codes))
-            if self.dropout and self.training:
+        inputs, slopes, drops = encoded, [], self.dropout and self.training
+        for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
+            product, shift = layer(inputs, codes)
+            beside = encoded if following.columns[1] else None
+            if drops:
+                hidden, slope = activation.shifted_with_slope(product, shift)
                 mask = kept(hidden, self.dropout)
-                hidden, slope = hidden * mask, slope * mask
+                inputs, slope = joined(hidden * mask, beside), slope * mask
+            else:
+                inputs, slope = activation.shifted_with_slope(product, shift, beside)
             slopes.append(slope)
-        sdf = self._head(hidden, encoded, codes)
+        sdf = self._head(inputs, encoded, codes)
         cotangent = torch.ones_like(sdf)[..., None]
         if self.tanh:
             cotangent = (1 - sdf * sdf)[..., None]

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numba
 import numpy as np
 import torch
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba.extending import intrinsic, overload
 from torch import Tensor
 
@@ -24,6 +24,11 @@ ROWS = 128
 _LOCK = threading.Lock()
 numba.config.THREADING_LAYER = "workqueue"
 # numba's OpenMP layer would change PyTorch's number of threads; this one takes one caller at a time
+
+_features = binding.get_host_cpu_features()
+if _features.get("avx512f") and not numba.config.CPU_FEATURES:
+    _features["prefer-256-bit"] = False  # LLVM shuns the widest registers; matrix products use them anyway
+    numba.config.CPU_NAME, numba.config.CPU_FEATURES = binding.get_host_cpu_name(), _features.flatten()
 
 _f = np.float32
 _FAST = {"contract", "nsz", "arcp"}
@@ -38,37 +43,41 @@ def fits(product: Tensor) -> bool:
 
 
 class Wave(torch.autograd.Function):
-    """a(product + shift), and with it a' where asked for: `Wave.apply(product, shift, log_beta, ...)`.
+    """[a(product + shift) | beside], and a' where asked for: `Wave.apply(product, shift, log_beta, ...)`.
 
     Args:
         product: [B, N, W], such that `fits`.
         shift: [W] or [B, 1, W] float32.
         log_beta: logarithm of the sharpness, a scalar tensor; None for a plain sine.
+        beside: [B, N, F], what the next layer reads too, or None: once here, nobody copies a later.
         omega: frequency factor.
         plain: x -> a(x), a'(x) as tensor operations, for whoever differentiates the gradient once more.
         with_slope: whether a' is returned too.
 
     Returns:
-        [B, N, W] with the dtype of `product`, or two of them.
+        [B, N, W + F] with the dtype of `product`, and a' [B, N, W] where asked for.
     """
 
     @staticmethod
-    def forward(ctx, product, shift, log_beta, omega: float, plain: Callable, with_slope: bool):
+    def forward(ctx, product, shift, log_beta, beside, omega: float, plain: Callable, with_slope: bool):
         ctx.omega, ctx.plain, ctx.with_slope = omega, plain, with_slope
         ctx.save_for_backward(product, shift, log_beta)
-        outputs = [
-            torch.empty_like(product, memory_format=torch.contiguous_format) for _ in range(1 + with_slope)
-        ]
-        slope = _flat(outputs[1]) if with_slope else None
-        _with_threads(_forward, *_given(ctx, product, shift, log_beta), _flat(outputs[0]), slope)
-        return tuple(outputs) if with_slope else outputs[0]
+        shapes, points, width = product.shape
+        value = product.new_empty(shapes, points, width + (0 if beside is None else beside.shape[2]))
+        slope = product.new_empty(product.shape) if with_slope else None
+        to_copy = None if beside is None else _flat(beside.to(product.dtype))
+        results = _flat(value), _flat(slope) if with_slope else None
+        _with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
+        return (value, slope) if with_slope else value
 
     @staticmethod
     def backward(ctx, by_value, by_slope=None):
         product, shift, log_beta = ctx.saved_tensors
-        if torch.is_grad_enabled():
-            return *_differentiable(ctx, by_value, by_slope), None, None, None
         shapes, points, width = product.shape
+        by_beside = by_value[..., width:] if ctx.needs_input_grad[3] else None
+        if torch.is_grad_enabled():
+            of_wave = _differentiable(ctx, by_value[..., :width], by_slope)
+            return *of_wave, by_beside, None, None, None
         chunks = shapes * -(-points // ROWS)
         by_product = product.new_empty(product.shape)
         by_shift, by_log_beta = torch.empty(2, chunks, width)
@@ -76,7 +85,8 @@ class Wave(torch.autograd.Function):
         results = _flat(by_product), by_shift.numpy(), by_log_beta.numpy()
         _with_threads(_backward, *_given(ctx, product, shift, log_beta), *cotangents, *results)
         by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
-        return by_product, by_shift, None if log_beta is None else by_log_beta.sum(), None, None, None
+        by_log_beta = None if log_beta is None else by_log_beta.sum()
+        return by_product, by_shift, by_log_beta, by_beside, None, None, None
 
 
 def _given(ctx, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
@@ -170,7 +180,7 @@ def _tanh(x):
 
 
 @numba.njit(parallel=True, fastmath=_FAST, cache=True)
-def _forward(product, shift, points, omega, beta, value, slope):
+def _forward(product, shift, points, omega, beta, beside, value, slope):
     per_shape = -(-points // ROWS)
     for chunk in numba.prange(product.shape[0] // points * per_shape):
         shape, part = chunk // per_shape, chunk % per_shape
@@ -185,6 +195,9 @@ def _forward(product, shift, points, omega, beta, value, slope):
                 value[p, j] = _narrowed(a, product[p, j])
                 if slope is not None:
                     slope[p, j] = _narrowed(d, product[p, j])
+            if beside is not None:
+                for j in range(beside.shape[1]):
+                    value[p, product.shape[1] + j] = beside[p, j]
 
 
 @numba.njit(parallel=True, fastmath=_FAST, cache=True)
