@@ -5,7 +5,8 @@
 Runs train.py on 10, 100 and 1000 procedural tables of 500,000 samples from a warm store, the counts one after
 the other in every round, and prints medians over the rounds as a Markdown table; beside them what importing
 torch and lightning alone costs here. Steps are the same for all: 10 shapes, 512 samples and 64 surface points
-of each. Then it times the drawing of such batches from 1000 shapes by itself.
+of each. Then it times the drawing of such batches from 1000 shapes by itself, and of the paper's (64 shapes,
+16,384 samples and 4096 surface points of each), whose limit is the rate at which memory is copied here.
 
 Only the first `--real` shapes are prepared; the others' files are copies of theirs, written under their own
 ids and fingerprints: speed and memory depend on the number and size of files, not on what they hold.
@@ -27,6 +28,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -41,6 +43,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "outputs" / "benchmarks" / "growth"
 COUNTS = (10, 100, 1000)
 PER_STEP, SAMPLES, SURFACE = 10, 512, 64
+PAPER_STEP = 64, 16_384, 4096
+"""Shapes, samples and surface points of each, as at scale=paper."""
 WARM_UP = 20
 """Steps left out of the speed."""
 
@@ -119,10 +123,13 @@ def imports() -> tuple[float, float]:
     return spent[-1][0] - spent[0][0], spent[-1][1]
 
 
-def draw_times(shapes: Store) -> tuple[float, float]:
-    """Seconds to draw a step's batch, while shapes are seen for the first time and later."""
-    augmentation = Augmentation()
-    loading = Loading(PER_STEP, SAMPLES, SURFACE, 1, workers=0, augmentation=augmentation, seed=0)
+def draw_times(shapes: Store, *sizes: int) -> tuple[float, float]:
+    """Seconds to draw a step's batch, while shapes are seen for the first time and later.
+
+    Args:
+        sizes: shapes a step, samples and surface points of each.
+    """
+    loading = Loading(*sizes, 1, workers=0, augmentation=Augmentation(), seed=0)
     batches = StepBatches(list(shapes), loading)
     seconds = []
     for step in range(2 * len(batches)):
@@ -130,6 +137,17 @@ def draw_times(shapes: Store) -> tuple[float, float]:
         batches[step]
         seconds.append(time.perf_counter() - start)
     return statistics.median(seconds[: len(batches)]), statistics.median(seconds[len(batches) :])
+
+
+def copy_rate() -> float:
+    """Bytes a second that one thread copies from memory to memory, beyond its caches."""
+    source = np.ones(2**28, np.uint8)
+    target, seconds = np.zeros_like(source), []
+    for _ in range(5):
+        start = time.perf_counter()
+        np.copyto(target, source)
+        seconds.append(time.perf_counter() - start)
+    return len(source) / statistics.median(seconds)
 
 
 def main() -> None:
@@ -167,13 +185,19 @@ def report(shapes: Store, arguments: argparse.Namespace) -> None:
             f"| {middle['memory'] / 1e9:.3f} | {middle['codes'] / 1e6:.3f} "
             f"| {middle['checkpoint'] / 1e6:.2f} |"
         )
-    first, later = draw_times(shapes)
+    first, later = draw_times(shapes, PER_STEP, SAMPLES, SURFACE)
     step = statistics.median(PER_STEP * SAMPLES / run.speed for run in found[COUNTS[-1]])
     clock, processor = (statistics.median(each) for each in zip(*alone, strict=True))
     print(f"\nImporting torch and lightning alone: {clock:.2f} s, {processor:.2f} s of the processor.")
     print(
         f"Drawing a batch from {len(shapes)} shapes: {first * 1e3:.2f} ms when they are first seen, "
         f"{later * 1e3:.2f} ms later, of a step's {step * 1e3:.1f} ms."
+    )
+    _, seconds = draw_times(shapes, *PAPER_STEP)
+    rate = PAPER_STEP[0] * (PAPER_STEP[1] * 16 + PAPER_STEP[2] * 24) / seconds
+    print(
+        f"Drawing a batch of the paper's: {seconds * 1e3:.1f} ms, {rate / 1e9:.2f} GB/s, "
+        f"{rate / copy_rate():.2f} of the rate of a copy."
     )
 
 
