@@ -11,6 +11,9 @@ on our account. The limit is the rate of a product [points worked on together, W
 decoder, timed in the same rounds.
 """
 
+import sdfhub  # noqa: F401  (before torch: it says how threads wait)
+
+# isort: split
 import argparse
 import statistics
 import sys
