@@ -4,6 +4,7 @@ Frame: a shape's bounding-box centre lies at 0 and its farthest vertex at 1 / 1.
 in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 """
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,18 @@ import torch
 
 RADIUS = 1 / 1.03
 """Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
+
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}\Z")
+
+
+def check_id(id: str) -> None:
+    """Refuses an id that is not safe as a path below a folder, such as `chairs/0007` is.
+
+    Raises:
+        ValueError: says what an id may hold.
+    """
+    if not isinstance(id, str) or not all(_PART.match(part) for part in id.split("/")):
+        raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
 
 
 def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
@@ -20,6 +33,38 @@ def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
     if not fits or array.dtype != dtype:
         wanted = f"{list(shape)} {dtype}"
         raise ValueError(f"{name}: expected {wanted}, got {list(array.shape)} {array.dtype}")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where a shape's normalised frame lies in its source's frame.
+
+    Args:
+        center: [3] float64, source units.
+        scale: normalised units per source unit, > 0.
+    """
+
+    center: np.ndarray
+    scale: float
+
+    def __post_init__(self):
+        _check("center", self.center, (3,), np.float64)
+        if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(
+                f"frame: center must be finite and scale positive, got {self.center}, {self.scale}"
+            )
+
+    def to_source(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] of the normalised frame in the source's."""
+        return points / self.scale + self.center
+
+    def to_normalized(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] of the source's frame in the normalised one."""
+        return (points - self.center) * self.scale
+
+
+NORMALIZED = Frame(np.zeros(3), 1.0)
+"""The frame of a shape that has no source: the normalised one itself."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def contact_sheet(
         for k, text in enumerate(caption.split("\n")):
             where = left + (j + 0.5) * size, 8 + (k + 0.5) * line
             draw.text(where, _shortened(text, font, size - 8), fill=_INK, font=font, anchor="mm")
-    return _write_png(page, Path(path))
+    return write_picture(page, Path(path))
 
 
 def _no_surface(draw: ImageDraw.ImageDraw, x: int, y: int, size: int) -> None:
@@ -67,12 +67,13 @@ def _shortened(text: str, font, width: float) -> str:
     return text + "…"
 
 
-def _write_png(page: Image.Image, path: Path) -> Path:
+def write_picture(picture: Image.Image, path: Path, **settings) -> Path:
+    """Writes a picture in the format of the path's suffix, whole or not at all; returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with open(part, "wb") as file:
-            page.save(file, format="PNG", optimize=False)
+            picture.save(file, format=path.suffix[1:], **settings)
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)

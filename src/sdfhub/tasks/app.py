@@ -17,9 +17,6 @@ import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.names import cell_name, run_name, sweep_name
 
-TASK_CONFIGS = ("config.yaml", "evaluate.yaml", "report.yaml")
-"""Configs whose top-level keys tasks read."""
-
 
 def configuration_folder() -> Path:
     """The folder of YAMLs: inside an installed package, beside `src/` in a checkout."""
@@ -48,7 +45,7 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
 
     def guarded(config: DictConfig) -> None:
         try:
-            refuse_strangers(config)
+            refuse_strangers(config, config_name)
             task(config)
         except (SdfhubError, OmegaConfBaseException, OSError) as error:
             if verbose:
@@ -73,25 +70,33 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     finally:
         os.environ["HYDRA_FULL_ERROR"] = str(int(verbose))
     for error in failures:
-        print(f"sdfhub: error: {one_line(error)}", file=sys.stderr)
+        print(f"sdfhub: error: {one_line(error, config_name)}", file=sys.stderr)
     if failures:
         sys.exit(2)
 
 
-def refuse_strangers(config: DictConfig) -> None:
+def first_word_as(key: str) -> None:
+    """Lets the command line's first word stand for a path: `sdfhub report DIR` for `... sweep=DIR`."""
+    first = sys.argv[1] if len(sys.argv) > 1 else "-"
+    if Path(first).is_dir() or (not first.startswith("-") and "=" not in first):
+        quoted = first.replace("\\", "\\\\").replace("'", "\\'")
+        sys.argv[1] = f"{key}='{quoted}'"  # quoted, so that Hydra takes any path as text
+
+
+def refuse_strangers(config: DictConfig, config_name: str) -> None:
     """Refuses top-level keys that nothing reads, such as `+sweep=...` written for `sweeps=...`.
 
     Raises:
         SdfhubError: names the key.
     """
-    known = set(_groups()) | {key for name in TASK_CONFIGS for key in _yaml(configuration_folder() / name)}
+    read = [_yaml(configuration_folder() / f"{name}.yaml") for name in ("config", config_name)]
     for key in config:
-        if key not in known:
-            raise SdfhubError(_no_such_key(str(key)))
+        if key not in {*_groups(), *read[0], *read[1]}:
+            raise SdfhubError(_no_such_key(str(key), config_name))
 
 
-def one_line(error: Exception) -> str:
-    """What a user needs of an error: what is wrong and, for a wrong choice, the choices."""
+def one_line(error: Exception, config_name: str = "config") -> str:
+    """What a user needs of an error: what is wrong and, for a wrong choice, the choices of that config."""
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
     text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
@@ -100,10 +105,10 @@ def one_line(error: Exception) -> str:
     missing = re.match(r"Missing mandatory value: (\S+)", text)
     if missing:
         return f"{missing.group(1)}=...: must be given"
-    return _no_such_key(unknown.group(1)) if unknown else text
+    return _no_such_key(unknown.group(1), config_name) if unknown else text
 
 
-def _no_such_key(key: str) -> str:
+def _no_such_key(key: str, config_name: str = "config") -> str:
     group, _, below = key.partition(".")
     groups = _groups()
     if below and group in groups:
@@ -111,9 +116,19 @@ def _no_such_key(key: str) -> str:
         near = get_close_matches(key, keys, n=1, cutoff=0.85)
         hint = f"did you mean {near[0]!r}?" if near else f"{group} has {', '.join(keys)}"
         return f"there is no key {key!r}; {hint}"
-    near = get_close_matches(key, groups, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"the groups are {', '.join(groups)}"
+    own = [] if config_name == "config" else _top_level_keys(config_name)
+    near = get_close_matches(key, own or groups, n=1)
+    choices = f"the keys are {', '.join(own)}" if own else f"the groups are {', '.join(groups)}"
+    hint = f"did you mean {near[0]!r}?" if near else choices
     return f"there is no group or key {key!r}; {hint}"
+
+
+def _top_level_keys(config_name: str) -> list[str]:
+    """What a task's own config can be given: its keys and the groups that it composes."""
+    node = _yaml(configuration_folder() / f"{config_name}.yaml")
+    composed = [group for entry in node["defaults"] if isinstance(entry, dict) for group in entry]
+    groups = [group.removeprefix("override ") for group in composed if "hydra" not in group]
+    return list(dict.fromkeys([*(key for key in node if key not in ("defaults", "hydra")), *groups]))
 
 
 def _groups() -> list[str]:

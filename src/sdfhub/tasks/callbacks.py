@@ -15,7 +15,7 @@ from sdfhub.geometry.mesher import sdf_slice
 from sdfhub.geometry.metrics import judge
 from sdfhub.geometry.render import render, slice_image
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks.evaluate import reconstruct
+from sdfhub.space import reconstruct
 
 TENSORBOARD_VERTICES = 60_000
 """TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""

@@ -8,6 +8,11 @@ TASKS = {
     "train": "learns a shape space: sdfhub train activation=hosc encoding=fourier",
     "prepare": "makes samples ahead of time: sdfhub prepare data=open category=chairs",
     "evaluate": "judges a finished run again: sdfhub evaluate run=RUN evaluate.resolution=512",
+    "export": "one file of a space, or its meshes: sdfhub export run=RUN to=safetensors",
+    "interpolate": "shapes between two: sdfhub interpolate run=RUN a=ID b=ID steps=8",
+    "sample": "new shapes of a space: sdfhub sample run=RUN n=8",
+    "neighbours": "the shapes most like one: sdfhub neighbours run=RUN of=ID",
+    "import-deepsdf": "an experiment of DeepSDF's code becomes a run: sdfhub import-deepsdf EXPERIMENT_DIR",
     "report": "tables, claims and a page from a sweep's folder: sdfhub report outputs/sweeps/table_small",
 }
 
@@ -17,14 +22,14 @@ def main() -> None:
     task = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if task in ("-h", "--help"):
         print("usage: sdfhub TASK [key=value ...]\n")
-        print("\n".join(f"  {name:<10}{about}" for name, about in TASKS.items()))
+        print("\n".join(f"  {name:<16}{about}" for name, about in TASKS.items()))
         return
     if task not in TASKS:
         print(f"sdfhub: error: there is no task {task!r}; choose {', '.join(TASKS)}", file=sys.stderr)
         sys.exit(2)
     del sys.argv[1]
     gc.disable()  # what imports make stays: looking it over for garbage is a fifth of a start
-    module = importlib.import_module(f"sdfhub.tasks.{task}")
+    module = importlib.import_module(f"sdfhub.tasks.{task.replace('-', '_')}")
     gc.freeze()
     gc.enable()
     module.main()

@@ -20,16 +20,17 @@ from sdfhub.data.splits import Split, split
 from sdfhub.data.store import shape_seed
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.mesher import Mesh, mesh_fields
+from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import Judge
-from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fitting import Fit
 from sdfhub.shapes import NormalizedMesh
+from sdfhub.space import reconstruct
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.opening import load
 from sdfhub.tasks.prepare import prepare_split
-from sdfhub.tasks.run import load_autodecoder, read_run
+from sdfhub.tasks.run import read_run
 from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
 
 WORTH_A_PROCESS = 4
@@ -73,7 +74,8 @@ class Evaluation:
 
 
 def evaluate_model(
-    model: AutoDecoder,
+    decoder: Decoder,
+    codes: Tensor,
     train: Mapping[int, StoredShape],
     held_out: Sequence[StoredShape],
     evaluation: Evaluation,
@@ -85,8 +87,9 @@ def evaluate_model(
     Shapes without a mesh (DeepSDF's npz files) are judged by their signed distances alone.
 
     Args:
-        model: trained.
-        train: shapes that it was trained on, by row of its code table.
+        decoder: trained.
+        codes: [S, L] code table.
+        train: shapes that it was trained on, by row of the table.
         held_out: shapes that it has not seen.
         evaluation: how to judge.
         out: folder of the results.
@@ -95,17 +98,16 @@ def evaluate_model(
     Returns:
         What `metrics.json` holds.
     """
-    model.eval()
+    decoder.eval()
     known, unseen = list(train.items())[: evaluation.known], list(held_out)[: evaluation.held_out]
-    codes = model.codes.table.detach()
     roles = [("known", shape, codes[row]) for row, shape in known]
     if unseen:
-        codes = fit_held_out(model.decoder, unseen, evaluation)
-        roles += [("held_out", shape, code) for shape, code in zip(unseen, codes, strict=True)]
+        fitted = fit_held_out(decoder, unseen, evaluation)
+        roles += [("held_out", shape, code) for shape, code in zip(unseen, fitted, strict=True)]
     if any(shape.mesh is None for _, shape, _ in roles):
-        rows = [(role, shape, distance_errors(model.decoder, code, shape)) for role, shape, code in roles]
+        rows = [(role, shape, distance_errors(decoder, code, shape)) for role, shape, code in roles]
         return write_distances(rows, training, out)
-    return write_scores(judge_all(model.decoder, roles, evaluation), evaluation, training, out)
+    return write_scores(judge_all(decoder, roles, evaluation), evaluation, training, out)
 
 
 def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:
@@ -155,24 +157,6 @@ def judge_all(
     ]
 
 
-def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:
-    """The zero levels of f(., z) of S codes, meshed together, one after another; empty without one.
-
-    Args:
-        decoder: in evaluation mode.
-        codes: [S, L].
-        resolution: points along an axis of the grid.
-
-    Yields:
-        vertices [V, 3], normalised frame, and faces [F, 3].
-    """
-
-    def fields(points: Tensor, shapes: Tensor) -> Tensor:
-        return decoder(points, codes[shapes])
-
-    return mesh_fields(fields, len(codes), resolution, device=codes.device)
-
-
 @torch.inference_mode()
 def distance_errors(
     decoder: Decoder, code: Tensor, shape: StoredShape, delta: float = 0.1
@@ -201,7 +185,7 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     out = check(config["out"], str | None, "out")
     evaluation = build(config["evaluate"], "evaluate")
     trained, roles_then = read_run(run)
-    model = load_autodecoder(run, trained)
+    space = load(run)
     data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
     then = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
@@ -213,9 +197,8 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     prepared = prepare_split(source, roles, preparation, data)
     known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
-    return evaluate_model(
-        model, known, prepared.held_out, evaluation, Path(out) if out else run / "evaluation"
-    )
+    out = Path(out) if out else run / "evaluation"
+    return evaluate_model(space.decoder, space.codes, known, prepared.held_out, evaluation, out)
 
 
 def choose_shapes(

@@ -1,6 +1,5 @@
 """Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
 
-import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from sdfhub.report.page import page
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import Group, group_cells
 from sdfhub.report.tables import claims_table, tables
-from sdfhub.tasks.app import run_task
+from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.run import write_text
 
@@ -86,10 +85,7 @@ def report(config: dict[str, Any]) -> None:
 
 def main() -> None:
     """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    first = sys.argv[1] if len(sys.argv) > 1 else "-"
-    if Path(first).is_dir() or (not first.startswith("-") and "=" not in first):
-        quoted = first.replace("\\", "\\\\").replace("'", "\\'")
-        sys.argv[1] = f"sweep='{quoted}'"  # quoted, so that Hydra takes any path as text
+    first_word_as("sweep")
 
     def task(config: DictConfig) -> None:
         report(plain(config))

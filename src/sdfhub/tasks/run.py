@@ -2,6 +2,7 @@
 
 config.yaml       the composed config, interpolations resolved
 split.json        ids of the shapes by role; training ids in the order of the code table
+frames.json       which axis is up, and where the training shapes lie in their sources' frames
 checkpoints/      last.ckpt and its predecessors
 metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 """
@@ -9,16 +10,21 @@ metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 import json
 import os
 import uuid
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 import yaml
 
 from sdfhub.errors import SdfhubError
-from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.codes import CodeTable
+from sdfhub.model.decoder import Decoder
+from sdfhub.shapes import Frame
 from sdfhub.tasks.build import build
+
+if TYPE_CHECKING:
+    from sdfhub.model.autodecoder import AutoDecoder
 
 
 def write_text(path: Path, text: str) -> None:
@@ -35,10 +41,23 @@ def write_text(path: Path, text: str) -> None:
         beside.unlink(missing_ok=True)
 
 
-def begin_run(run: Path, config: dict[str, Any], train: list[str], held_out: list[str]) -> None:
+def begin_run(
+    run: Path,
+    config: dict[str, Any],
+    train: Sequence[str],
+    held_out: Sequence[str],
+    frames: Mapping[str, Frame],
+    up: Literal["y", "z"],
+) -> None:
     """Writes down what a run is made of, before it starts."""
     write_text(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
-    write_text(run / "split.json", json.dumps({"train": train, "held_out": held_out}, indent=1))
+    write_text(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
+    write_text(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))
+
+
+def plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
+    """Frames as plain numbers: centre and scale, four of them."""
+    return {id: [*map(float, frame.center), float(frame.scale)] for id, frame in frames.items()}
 
 
 def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
@@ -59,7 +78,19 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
     return config, split
 
 
-def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> AutoDecoder:
+def build_decoder(node: Mapping[str, Any]) -> Decoder:
+    """The untrained decoder that a plain node `decoder` of a config describes.
+
+    Its classes are decoders, encodings and activations of this package, whatever the node names.
+    """
+    given = {}
+    for part, within in (("encoding", "sdfhub.model.encodings"), ("activation", "sdfhub.model.activations")):
+        given[part] = build(node.get(part) or {}, f"decoder.{part}", within=within)
+    rest = {key: value for key, value in node.items() if key not in given}
+    return build(rest, "decoder", within="sdfhub.model.decoder", **given)
+
+
+def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> "AutoDecoder":
     """The untrained model that a plain config describes, seeded.
 
     Args:
@@ -67,9 +98,11 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> Auto
         rows: codes in the table.
         steps: optimiser steps of the whole training; only training needs it.
     """
+    from sdfhub.model.autodecoder import AutoDecoder  # here: a space is opened without Lightning
+
     torch.manual_seed(config["seed"])
     return AutoDecoder(
-        decoder=build(config["decoder"], "decoder", within="sdfhub.model"),
+        decoder=build_decoder(config["decoder"]),
         codes=_codes(config, rows),
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
@@ -110,8 +143,8 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
     return weights
 
 
-def put_weights(model: AutoDecoder, weights: dict[str, torch.Tensor], path: Path) -> None:
-    """Loads weights into a model.
+def put_weights(model: torch.nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Loads weights into an auto-decoder or a decoder.
 
     Raises:
         SdfhubError: they belong to a model of another shape; `path` says whose they are.
@@ -121,16 +154,3 @@ def put_weights(model: AutoDecoder, weights: dict[str, torch.Tensor], path: Path
     except (RuntimeError, TypeError, AttributeError) as error:
         detail = str(error).splitlines()[-1].strip()
         raise SdfhubError(f"{path}: holds another model than the one configured: {detail}") from error
-
-
-def load_autodecoder(run: Path, config: dict[str, Any]) -> AutoDecoder:
-    """The trained model of a run, on the CPU, in evaluation mode.
-
-    Raises:
-        SdfhubError: no readable checkpoint, or one of another model.
-    """
-    path = run / "checkpoints" / "last.ckpt"
-    weights = read_weights(path)
-    model = build_autodecoder(config, rows=len(weights["codes.table"]))
-    put_weights(model, weights, path)
-    return model.eval()

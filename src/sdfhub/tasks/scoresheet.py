@@ -16,6 +16,7 @@ from sdfhub.data.shards import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.metrics import ShapeMetrics, summarize
 from sdfhub.geometry.render import render
+from sdfhub.tasks.mesh_file import write_mesh
 from sdfhub.tasks.run import write_text
 
 COLUMNS = {
@@ -60,7 +61,8 @@ def write_scores(
         result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
     write_text(out / "metrics.csv", _csv(judged))
     for row in judged:
-        _write_mesh(row, out / "meshes" / row.role / f"{row.shape.id}.ply")
+        vertices = row.vertices / row.shape.scale + row.shape.center
+        write_mesh(vertices, row.faces, out / "meshes" / row.role / f"{row.shape.id}.ply")
     _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
     write_text(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print(table(judged))
@@ -112,19 +114,6 @@ def _csv(judged: Sequence[Judged]) -> str:
     for row in judged:
         writer.writerow([row.role, row.shape.id, *(getattr(row.metrics, field) for field in fields)])
     return text.getvalue()
-
-
-def _write_mesh(row: Judged, path: Path) -> None:
-    """The reconstruction as PLY, back in its source's frame; nothing where there is no surface."""
-    if not len(row.faces):
-        return
-    import trimesh  # here: slow to import, and every training would wait for it before its first step
-
-    vertices = row.vertices / row.shape.scale + row.shape.center
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".part.ply")
-    trimesh.Trimesh(vertices, row.faces, process=False).export(beside)
-    beside.replace(path)
 
 
 def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:

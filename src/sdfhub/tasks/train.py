@@ -17,6 +17,7 @@ from torch import Tensor
 from sdfhub.data.batches import Loading
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Frame
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.callbacks import LossBar, TrainingRecord
@@ -61,7 +62,14 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     if parts.weights:
         put_weights(model, parts.weights, parts.resume_from)
-    begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
+    begin_run(
+        run,
+        config,
+        train=[shape.id for shape in prepared.train],
+        held_out=[shape.id for shape in prepared.held_out],
+        frames={shape.id: Frame(shape.center, shape.scale) for shape in prepared.train},
+        up=prepared.train[0].up,
+    )
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
     trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
@@ -73,7 +81,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     if not parts.record.stepped:
         print(f"nothing was left to train in {parts.resume_from}: raise trainer.max_epochs to go on")
     known = dict(enumerate(prepared.train))
-    metrics = evaluate_model(model, known, prepared.held_out, parts.evaluation, run, training)
+    codes = model.codes.table.detach()
+    metrics = evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
     trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
     return metrics
 

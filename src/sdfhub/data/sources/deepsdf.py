@@ -51,8 +51,7 @@ class DeepSdfSource(Source):
         test_split: str | None = None,
     ):
         self.root = Path(root)
-        settings = plain_categories(categories) if categories else {}
-        self.category_of = {each["synset"]: name for name, each in settings.items() if each.get("synset")}
+        self.category_of = by_synset(categories)
         self.train_split, self.test_split = train_split, test_split
         self.name = name_of_root("deepsdf", self.root)
         self._files: dict[str, Path] = {}
@@ -81,9 +80,27 @@ class DeepSdfSource(Source):
         return file.relative_to(self.root).with_suffix("").as_posix()
 
     def _id(self, file: Path) -> str:
-        parents = self._path(file).split("/")[:-1]
-        folder = "_".join(part for part in parents if part != _SAMPLES) or "folder"
-        return f"{folder_safe(self.category_of.get(file.parent.name, folder))}/{folder_safe(file.stem)}"
+        return shape_id(self._path(file), self.category_of, self.root.name)
+
+
+def by_synset(categories: Mapping | None) -> dict[str, str]:
+    """Category of each synset that the settings of categories name."""
+    settings = plain_categories(categories) if categories else {}
+    return {each["synset"]: name for name, each in settings.items() if each.get("synset")}
+
+
+def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
+    """The id of the shape whose samples lie at a path such as `ShapeNetV2/03001627/1a2b`, without suffix.
+
+    Args:
+        path: below the root.
+        category_of: category of each synset.
+        above: name of the root.
+    """
+    *parents, stem = path.split("/")
+    folder = "_".join(part for part in parents if part != _SAMPLES) or "folder"
+    category = category_of.get(parents[-1] if parents else above, folder)
+    return f"{folder_safe(category)}/{folder_safe(stem)}"
 
 
 def read_samples(path: Path) -> ShapeSamples:
@@ -97,7 +114,7 @@ def read_samples(path: Path) -> ShapeSamples:
         what = f"{path}: {len(positive)} samples outside, {len(negative)} inside"
         raise RejectedMesh("one_sided_samples", what)
     rows = np.concatenate([positive, negative])
-    center, scale = _frame(path)
+    center, scale = frame_of(path) or (np.zeros(3), 1.0)
     none = np.zeros((0, 3), dtype=np.float32)
     statistics = {"inside": len(negative) / len(rows)}
     return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, center, scale, None, statistics)
@@ -111,12 +128,19 @@ def _rows(path: Path, name: str) -> np.ndarray:
     return rows[np.isfinite(rows).all(axis=1)]
 
 
-def _frame(path: Path) -> tuple[np.ndarray, float]:
-    """Centre and scale of the source, from DeepSDF's `normalised = (source + offset) * scale`."""
+def frame_of(path: Path) -> tuple[np.ndarray, float] | None:
+    """Centre and scale of the source, from DeepSDF's `normalised = (source + offset) * scale`; None: unknown.
+
+    Args:
+        path: of the samples, `.../SdfSamples/...npz`, whether or not they are there.
+
+    Raises:
+        RejectedMesh: corrupt_file.
+    """
     parts = [_PARAMETERS if part == _SAMPLES else part for part in path.parts]
     beside = Path(*parts)
     if _SAMPLES not in path.parts or not beside.is_file():
-        return np.zeros(3), 1.0
+        return None
     offset, scale = _array(beside, "offset").ravel(), _array(beside, "scale").ravel()
     is_finite = bool(np.isfinite([*offset, *scale]).all())
     if offset.shape != (3,) or scale.shape != (1,) or not is_finite or scale[0] <= 0:

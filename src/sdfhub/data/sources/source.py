@@ -12,12 +12,10 @@ from typing import Literal
 import numpy as np
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import ShapeSamples
+from sdfhub.shapes import ShapeSamples, check_id
 
 Triangles = tuple[np.ndarray, np.ndarray]
 """vertices [V, 3] float64 and faces [F, 3] int64 in the source's own frame."""
-
-_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}\Z")
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,7 @@ class Shape:
     credits: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
-        if not all(_PART.match(part) for part in self.id.split("/")):
-            raise ValueError(f"shape id {self.id!r}: parts must be letters, digits or _ . + -")
+        check_id(self.id)
 
 
 class Source(ABC):

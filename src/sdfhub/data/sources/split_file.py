@@ -39,7 +39,7 @@ def with_roles(
 
 
 def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[str]:
-    names = set(_names(file, role))
+    names = set(names_listed(file, role))
     endings = {ending for name in names for ending in _endings(name)}
     listed = [shape.id for shape, path in shapes if path in endings or not names.isdisjoint(_endings(path))]
     if not listed:
@@ -47,7 +47,8 @@ def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[s
     return listed
 
 
-def _names(file: str, role: str) -> Iterator[str]:
+def names_listed(file: str, role: str) -> Iterator[str]:
+    """The names that a split file lists for a role, in its order; nested keys become parts of a path."""
     try:
         content = json.loads(Path(file).read_text())
     except OSError as error:

@@ -1,0 +1,233 @@
+"""A trained shape space as a library: signed distances, meshes and codes of its shapes, without its trainer.
+
+    space = sdfhub.load("outputs/RUN")
+    vertices, faces = space.mesh("chairs/0007")
+    distances = space.sdf(points, "chairs/0007")
+
+A shape is an id, a row of the code table, or a code. Points are in the normalised frame unless said otherwise.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesher import Mesh, mesh_fields
+from sdfhub.model.computing import Computing
+from sdfhub.model.decoder import Decoder
+from sdfhub.model.distribution import CodeDistribution
+from sdfhub.model.fitting import Fit
+from sdfhub.shapes import NORMALIZED, Frame, check_id
+
+Array = np.ndarray | Tensor
+Shape = str | int | Array
+"""An id, a row of the code table, or a code [L]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """A decoder, the codes of the shapes it was trained on, and what is known of them.
+
+    Args:
+        decoder: f_theta, in evaluation mode, its weights without gradients.
+        codes: [S, L] float32, on the decoder's device.
+        ids: of the S shapes, in the order of the codes.
+        frames: where shapes lie in their sources' frames, as far as it is known.
+        up: the axis that points up in the source's frame, for pictures.
+        config: what the training was composed of: plain data.
+        metrics: what `metrics.json` of the run holds; None where nothing was judged.
+        how_to_fit: finds the codes of other shapes.
+    """
+
+    decoder: Decoder
+    codes: Tensor
+    ids: tuple[str, ...]
+    frames: Mapping[str, Frame]
+    up: Literal["y", "z"]
+    config: dict[str, Any]
+    metrics: dict[str, Any] | None
+    how_to_fit: Fit
+
+    def __post_init__(self):
+        for id in self.ids:
+            check_id(id)
+        if self.codes.shape != (len(self.ids), self.decoder.code_size) or not len(self.ids):
+            wanted = [len(self.ids), self.decoder.code_size]
+            raise ValueError(f"codes: expected {wanted}, at least one, got {list(self.codes.shape)}")
+        if self.codes.dtype != torch.float32 or not torch.isfinite(self.codes).all():
+            raise ValueError("codes: must be finite float32 numbers")
+        if len(set(self.ids)) < len(self.ids) or not self.frames.keys() <= set(self.ids):
+            raise ValueError("ids: must differ, and frames belong to them")
+        if self.up not in ("y", "z"):
+            raise ValueError(f"up: must be y or z, got {self.up!r}")
+
+    @property
+    def device(self) -> torch.device:
+        """Where the codes and the decoder are."""
+        return self.codes.device
+
+    def row(self, shape: str | int) -> int:
+        """The row of a shape in the code table.
+
+        Raises:
+            SdfhubError: there is no such shape; names the id that is spelt most alike.
+        """
+        if isinstance(shape, str):
+            if shape in self.ids:
+                return self.ids.index(shape)
+            near = get_close_matches(shape, self.ids, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.ids[:3])} ..."
+            raise SdfhubError(f"this space has no shape {shape!r}; {hint}")
+        if not 0 <= shape < len(self.ids):
+            raise SdfhubError(f"this space has no row {shape}; its rows are 0 to {len(self.ids) - 1}")
+        return int(shape)
+
+    def code(self, shape: Shape | Sequence[Shape]) -> Tensor:
+        """The code [L] of a shape, or the codes [B, L] of several.
+
+        Raises:
+            SdfhubError: a shape that is not there, or a code of another size.
+        """
+        if isinstance(shape, str | int | np.integer):
+            return self.codes[self.row(shape)]
+        if isinstance(shape, Sequence):
+            return torch.stack([self.code(one) for one in shape])
+        code = self._tensor(shape)
+        if code.dim() not in (1, 2) or code.shape[-1] != self.codes.shape[1]:
+            raise SdfhubError(f"a code has {self.codes.shape[1]} numbers, got {list(code.shape)}")
+        return code
+
+    def frame(self, shape: Shape) -> Frame:
+        """Where a shape lies in its source's frame; the normalised frame itself where that is not known."""
+        is_named = isinstance(shape, str | int | np.integer)
+        return self.frames.get(self.ids[self.row(shape)], NORMALIZED) if is_named else NORMALIZED
+
+    def sdf(self, points: Array, shape: Shape | Sequence[Shape]) -> Tensor:
+        """Signed distances [N] at points [N, 3] of one shape, or [B, N] at [B, N, 3] of B; negative inside.
+
+        Differentiable by points and codes, as often as the decoder is.
+
+        Args:
+            points: normalised frame.
+            shape: one, or as many as points has rows.
+        """
+        points, codes = self._tensor(points), self.code(shape)
+        is_one = points.dim() == 2
+        if points.shape[-1:] != (3,) or points.dim() != codes.dim() + 1:
+            what = f"points {list(points.shape)} and codes {list(codes.shape)}"
+            raise SdfhubError(f"sdf takes points [N, 3] of one shape or [B, N, 3] of B shapes, got {what}")
+        points, codes = (points[None], codes[None]) if is_one else (points, codes)
+        parts = [points]
+        if not (torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)):
+            together = max(1, Computing().together(self.device) // len(points))
+            parts = points.split(together, dim=1)
+        distances = torch.cat([self.decoder(part, codes) for part in parts], dim=1)
+        return distances[0] if is_one else distances
+
+    def mesh(self, shape: Shape, resolution: int = 256) -> Mesh:
+        """The surface of a shape, in its source's frame or, where a code has none, the normalised one.
+
+        Args:
+            shape: which.
+            resolution: points along an axis of the grid, >= 2.
+
+        Returns:
+            vertices [V, 3] float64 and faces [F, 3] int64; V = F = 0 where the field has no zero level.
+        """
+        return next(self.meshes([shape], resolution))
+
+    def meshes(self, shapes: Sequence[Shape] | Tensor, resolution: int = 256) -> Iterator[Mesh]:
+        """The surfaces of several shapes, worked out together, each as `mesh` gives it."""
+        found = reconstruct(self.decoder, self.code(shapes), resolution)
+        for shape, (vertices, faces) in zip(shapes, found, strict=True):
+            yield self.frame(shape).to_source(vertices), faces
+
+    def fit(
+        self, points: Array, normals: Array | None = None, sdf: Array | None = None, seed: int = 0
+    ) -> Tensor:
+        """The code [L] of a shape that the space has not seen.
+
+        Args:
+            points: [N, 3], normalised frame.
+            normals: [N, 3] outward unit normals of surface points.
+            sdf: [N] signed distances, negative inside; None where the points lie on the surface.
+            seed: of the start.
+        """
+        if sdf is None or normals is not None:
+            raise SdfhubError("fit: takes signed distances: give sdf=, and no normals")
+        points, sdf = self._tensor(points), self._tensor(sdf)
+        if points.dim() != 2 or points.shape[-1] != 3 or sdf.shape != points.shape[:1] or not len(sdf):
+            what = f"{list(points.shape)} and {list(sdf.shape)}"
+            raise SdfhubError(f"fit: expected points [N, 3] and sdf [N], N at least 1, got {what}")
+        if not (torch.isfinite(points).all() and torch.isfinite(sdf).all()):
+            raise SdfhubError("fit: points and sdf must be finite")
+
+        def draw(step: int) -> tuple[Tensor, Tensor]:
+            random = torch.Generator().manual_seed(seed + step)
+            rows = torch.randperm(len(sdf), generator=random)[: self.how_to_fit.samples].to(self.device)
+            return points[None, rows], sdf[None, rows]
+
+        return self.how_to_fit(self.decoder, draw, [seed])[0]
+
+    def interpolate(self, a: Shape, b: Shape, steps: int) -> Tensor:
+        """Codes [steps, L] in equal steps along the line from a to b, both included; steps >= 2."""
+        if steps < 2:
+            raise SdfhubError(f"steps={steps}: must be at least 2")
+        share = torch.linspace(0, 1, steps, device=self.device)[:, None]
+        return torch.lerp(self.code(a)[None], self.code(b)[None], share)
+
+    def neighbours(self, shape: Shape, k: int = 5) -> list[tuple[str, float]]:
+        """Ids of the k shapes with the nearest codes, and how far they are; a shape is not its own."""
+        if k < 1:
+            raise SdfhubError(f"k={k}: must be at least 1")
+        distances = (self.codes - self.code(shape).detach()).norm(dim=1)
+        if isinstance(shape, str | int | np.integer):
+            distances[self.row(shape)] = torch.inf
+        values, rows = distances.topk(min(k, len(self.ids)), largest=False)
+        found = zip(rows.tolist(), values.tolist(), strict=True)
+        return [(self.ids[row], value) for row, value in found if np.isfinite(value)]
+
+    @cached_property
+    def distribution(self) -> CodeDistribution:
+        """A Gaussian fitted to the codes."""
+        return CodeDistribution.of(self.codes)
+
+    @property
+    def principal_directions(self) -> Tensor:
+        """[K, L] principal axes of the codes, each one standard deviation long, the longest first."""
+        return self.distribution.axes
+
+    def sample(self, n: int, seed: int = 0) -> Tensor:
+        """Codes [n, L] of new shapes, drawn from the distribution of the known ones."""
+        if n < 1:
+            raise SdfhubError(f"n={n}: must be at least 1")
+        return self.distribution.sample(n, seed)
+
+    def _tensor(self, array: Array) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+
+
+def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:
+    """The zero levels of f(., z) of S codes, meshed together, one after another; empty without one.
+
+    Args:
+        decoder: in evaluation mode.
+        codes: [S, L].
+        resolution: points along an axis of the grid.
+
+    Yields:
+        vertices [V, 3], normalised frame, and faces [F, 3].
+    """
+    if resolution < 2:
+        raise SdfhubError(f"resolution={resolution}: must be at least 2")
+
+    def fields(points: Tensor, shapes: Tensor) -> Tensor:
+        return decoder(points, codes[shapes])
+
+    return mesh_fields(fields, len(codes), resolution, device=codes.device)

@@ -1,0 +1,118 @@
+"""Task `export`: a space as one file, as a function for other runtimes, or as meshes."""
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from omegaconf import DictConfig
+from torch.export import Dim
+from tqdm import tqdm
+
+from sdfhub.data.shards import write_whole
+from sdfhub.errors import SdfhubError
+from sdfhub.model.decoder import Decoder
+from sdfhub.space import Space
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import check, plain
+from sdfhub.tasks.mesh_file import FORMATS, write_mesh
+from sdfhub.tasks.opening import beside, load, write_space
+
+FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
+"""What a space is exported as in one file, and the file's name by default."""
+
+
+def export(config: dict[str, Any]) -> None:
+    """The task: `config` as conf/export.yaml has it."""
+    run, to = check(config["run"], str, "run"), check(config["to"], str, "to")
+    folder = beside(run, check(config["out"], str | None, "out"), "export")
+    if to == "meshes":
+        export_meshes(config, folder)
+        return
+    path = folder / FILES[to] if to in FILES else Path(to)
+    kind = {Path(file).suffix: kind for kind, file in FILES.items()}.get(path.suffix)
+    if kind is None:
+        raise SdfhubError(
+            f"to={to}: choose {', '.join(FILES)}, meshes, or a .safetensors, .onnx or .pt2 file"
+        )
+    space = load(run, device="cpu")
+    if kind != "safetensors":
+        write_function(space.decoder, kind, path)
+        print(f"function:  {path}: points [B, N, 3] and codes [B, L] to sdf [B, N]")
+        path = path.with_suffix(".safetensors")  # the codes of the shapes
+    write_space(space, path)
+    print(f"space:     {path}: sdfhub.load({str(path)!r})")
+
+
+def export_meshes(config: dict[str, Any], folder: Path) -> None:
+    """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
+    suffix = check(config["format"], Literal[FORMATS], "format")
+    chosen = check(config["shapes"], list[str | int] | None, "shapes")
+    resolution = check(config["resolution"], int, "resolution")
+    space = load(check(config["run"], str, "run"))
+    rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]
+    if not rows:
+        raise SdfhubError("shapes=[]: name at least one, or null for all")
+    empty = []
+    meshes = tqdm(space.meshes(list(rows), resolution), total=len(rows), unit="shape", disable=None)
+    for row, (vertices, faces) in zip(rows, meshes, strict=True):
+        write_mesh(vertices, faces, folder / "meshes" / f"{space.ids[row]}.{suffix}")
+        empty += [] if len(faces) else [space.ids[row]]
+    is_known = all(space.ids[row] in space.frames for row in rows)
+    frame = "their source's frame" if is_known else "the normalised frame: the run does not know its source's"
+    print(f"meshes:    {folder / 'meshes'}: {len(rows) - len(empty)} in {frame}")
+    if empty:
+        print(f"without a surface: {', '.join(empty)}")
+
+
+def write_function(decoder: Decoder, kind: Literal["onnx", "torch_export"], path: Path) -> None:
+    """Writes a decoder as a function of points [B, N, 3] and codes [B, L] for any B and N >= 1.
+
+    Raises:
+        SdfhubError: what this needs is not installed.
+    """
+    example = (torch.zeros(2, 5, 3), torch.zeros(2, decoder.code_size))
+    batch, points = Dim("B", min=1), Dim("N", min=1)
+    shapes = {"points": {0: batch, 1: points}, "codes": {0: batch}}
+    content = io.BytesIO()
+    with _quiet():
+        program = torch.export.export(decoder, example, dynamic_shapes=shapes)
+        if kind == "onnx":
+            content.write(_onnx(program))
+        else:
+            torch.export.save(program, content)
+    write_whole(path, content.getvalue())
+
+
+def _onnx(program: torch.export.ExportedProgram) -> bytes:
+    try:
+        import onnxscript  # noqa: F401 - torch's own exporter is written in it
+    except ImportError as error:
+        raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
+    names = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+    made = torch.onnx.export(program, **names, dynamo=True, verbose=False)
+    return made.model_proto.SerializeToString()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what PyTorch says to its own developers."""
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def main() -> None:
+    """Console entry: `sdfhub export run=RUN to=safetensors`."""
+
+    def task(config: DictConfig) -> None:
+        export(plain(config))
+
+    run_task(task, "export")

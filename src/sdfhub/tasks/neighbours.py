@@ -1,0 +1,34 @@
+"""Task `neighbours`: the known shapes whose codes are nearest to one's."""
+
+from typing import Any
+
+from omegaconf import DictConfig
+
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import check, plain
+from sdfhub.tasks.gallery import write_gallery
+from sdfhub.tasks.opening import beside, load
+
+
+def neighbours(config: dict[str, Any]) -> None:
+    """The task: `config` as conf/neighbours.yaml has it."""
+    run, shape = check(config["run"], str, "run"), check(config["of"], str | int, "of")
+    out = check(config["out"], str | None, "out")
+    resolution = check(config["resolution"], int, "resolution")
+    space = load(run)
+    found = space.neighbours(shape, check(config["k"], int, "k"))
+    of = space.ids[space.row(shape)]
+    for id, distance in found:
+        print(f"{id:<40} {distance:.4f}")
+    captions = [f"of {of}", *(f"{id}\n{distance:.3f}" for id, distance in found)]
+    codes = space.code([of, *(id for id, _ in found)])
+    write_gallery(space, codes, captions, beside(run, out, f"neighbours/{of.replace('/', '-')}"), resolution)
+
+
+def main() -> None:
+    """Console entry: `sdfhub neighbours run=RUN of=ID k=7`."""
+
+    def task(config: DictConfig) -> None:
+        neighbours(plain(config))
+
+    run_task(task, "neighbours")
