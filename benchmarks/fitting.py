@@ -19,16 +19,18 @@ import torch
 import yaml
 from runs import ROOT, train
 
+import sdfhub
 from sdfhub.data.batches import signed_samples
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
+from sdfhub.space import reconstruct
 from sdfhub.tasks.build import build
-from sdfhub.tasks.evaluate import Evaluation, fit_held_out, reconstruct
+from sdfhub.tasks.evaluate import Evaluation, fit_held_out
 from sdfhub.tasks.prepare import prepare_split
-from sdfhub.tasks.run import load_autodecoder, read_run
+from sdfhub.tasks.run import read_run
 
 FRESH = 40_000
 """Samples of a shape on which its objective is measured, drawn apart from those of the fits."""
@@ -109,8 +111,9 @@ def main() -> None:
         settings = ["scale=cpu_200", "callbacks=none", "evaluate.known=1", "evaluate.held_out=0"]
         train(name, f"experiment={arguments.experiment}", *settings)
         space = ROOT / "outputs" / "benchmarks" / name
-    model = load_autodecoder(space, read_run(space)[0])
-    compare(model.decoder, unseen_shapes(space, arguments.shapes), arguments.reference)
+    compare(
+        sdfhub.load(space, device="cpu").decoder, unseen_shapes(space, arguments.shapes), arguments.reference
+    )
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
+from sdfhub.tasks.run import build_autodecoder, put_weights, read_run, read_weights
 
 TOLERANCE = 1e-6
 SMALL = [
@@ -69,9 +69,12 @@ def space(name: str, shapes: int) -> AutoDecoder:
         space("chairs", shapes)  # for its settings
         config, _ = read_run(folder("chairs", shapes))
         return shifted(build_autodecoder(config, shapes).eval())
+    last = folder(name, shapes) / "checkpoints" / "last.ckpt"
     if not (folder(name, shapes) / "metrics.json").exists():
         train(folder(name, shapes).name, *SMALL, *SPACES[name], f"data.shapes={shapes}")
-    return load_autodecoder(folder(name, shapes), read_run(folder(name, shapes))[0])
+    model = build_autodecoder(read_run(folder(name, shapes))[0], shapes)
+    put_weights(model, read_weights(last), last)
+    return model.eval()
 
 
 def folder(name: str, shapes: int) -> Path:

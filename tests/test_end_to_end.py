@@ -15,12 +15,13 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import sdfhub
 from sdfhub.data.procedural import generate
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
 from sdfhub.tasks.evaluate import choose_shapes, evaluate_run
-from sdfhub.tasks.run import build_autodecoder, load_autodecoder, read_run
+from sdfhub.tasks.run import build_autodecoder, read_weights
 from tests.test_config import composed
 
 ROOT = Path(__file__).parents[1]
@@ -182,25 +183,16 @@ def test_trained_shapes_are_never_judged_as_unseen_ones_under_other_settings_of_
         choose_shapes(source, {"train": [], "held_out": []}, set(known), config | {"shapes": known})
 
 
-def test_loading_runs_no_code_of_a_strangers_checkpoint(trained, tmp_path):
+def test_a_trained_run_opens_as_a_space_with_the_frames_of_its_shapes(trained):
     folder, _ = trained
-    config, _ = read_run(folder)
-    canary = tmp_path / "canary"
-
-    class Stranger:
-        def __reduce__(self):
-            return os.system, (f"touch {canary}",)
-
-    (tmp_path / "checkpoints").mkdir()
-    torch.save({"state_dict": Stranger()}, tmp_path / "checkpoints" / "last.ckpt")
-    with pytest.raises(SdfhubError, match="not a readable checkpoint"):
-        load_autodecoder(tmp_path, config)
-    config["decoder"]["width"] += 1
-    with pytest.raises(SdfhubError, match="another model"):
-        load_autodecoder(folder, config)
-    config["decoder"]["width"] -= 1
-    assert not canary.exists()
-    assert load_autodecoder(folder, config).codes.table.shape[0] == 3
+    space = sdfhub.load(folder, device="cpu")
+    known = json.loads((folder / "split.json").read_text())["train"]
+    assert space.ids == tuple(known) and set(space.frames) == set(known) and space.up == "z"
+    assert space.metrics["known"]["summary"]["failed"] == 0
+    vertices, _ = space.mesh(known[0], resolution=48)
+    category, index = known[0].split("/")
+    truth = generate(category, int(index))[0]
+    assert np.allclose(vertices.max(0), truth.max(0), atol=0.1 * np.ptp(truth))
 
 
 def test_evaluate_without_a_run_says_so(tmp_path):
@@ -273,7 +265,7 @@ def test_two_processes_train_like_one_with_the_same_batch(tmp_path):
         one, both = (curve(folder, tag) for folder in folders)
         assert len(one) == 10
         np.testing.assert_allclose(one, both, rtol=1e-4)
-    states = [load_autodecoder(folder, read_run(folder)[0]).state_dict() for folder in folders]
+    states = [read_weights(folder / "checkpoints" / "last.ckpt") for folder in folders]
     for name, value in states[0].items():
         assert torch.allclose(value, states[1][name], atol=1e-4), name
 

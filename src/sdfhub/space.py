@@ -1,10 +1,21 @@
 """A trained shape space as a library: signed distances, meshes and codes of its shapes, without its trainer.
 
-    space = sdfhub.load("outputs/RUN")
-    vertices, faces = space.mesh("chairs/0007")
-    distances = space.sdf(points, "chairs/0007")
+>>> space = sdfhub.load(run)
+>>> space.ids[0], space.codes.shape
+('balls/small', torch.Size([4, 4]))
+>>> vertices, faces = space.mesh("balls/small", resolution=32)
+>>> points = torch.zeros(10, 3, requires_grad=True)
+>>> distances = space.sdf(points, "balls/small")
+>>> outward = torch.autograd.grad(distances.sum(), points)[0]
+>>> code = space.fit(points=points.detach(), sdf=distances.detach())
+>>> between = space.interpolate("balls/small", code, steps=5)
+>>> len(list(space.meshes(between, resolution=16)))
+5
+>>> space.sample(3, seed=0).shape
+torch.Size([3, 4])
 
-A shape is an id, a row of the code table, or a code. Points are in the normalised frame unless said otherwise.
+A shape is an id, a row of the code table, or a code. Points are in the normalised frame, meshes in their
+source's.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

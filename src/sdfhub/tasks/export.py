@@ -16,7 +16,6 @@ from tqdm import tqdm
 from sdfhub.data.shards import write_whole
 from sdfhub.errors import SdfhubError
 from sdfhub.model.decoder import Decoder
-from sdfhub.space import Space
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.mesh_file import FORMATS, write_mesh
@@ -36,12 +35,11 @@ def export(config: dict[str, Any]) -> None:
     path = folder / FILES[to] if to in FILES else Path(to)
     kind = {Path(file).suffix: kind for kind, file in FILES.items()}.get(path.suffix)
     if kind is None:
-        raise SdfhubError(
-            f"to={to}: choose {', '.join(FILES)}, meshes, or a .safetensors, .onnx or .pt2 file"
-        )
+        choices = ", ".join([*FILES, "meshes"])
+        raise SdfhubError(f"to={to}: choose {choices}, or a .safetensors, .onnx or .pt2 file")
     space = load(run, device="cpu")
     if kind != "safetensors":
-        write_function(space.decoder, kind, path)
+        write_whole(path, function_file(as_function(space.decoder), kind))
         print(f"function:  {path}: points [B, N, 3] and codes [B, L] to sdf [B, N]")
         path = path.with_suffix(".safetensors")  # the codes of the shapes
     write_space(space, path)
@@ -69,33 +67,33 @@ def export_meshes(config: dict[str, Any], folder: Path) -> None:
         print(f"without a surface: {', '.join(empty)}")
 
 
-def write_function(decoder: Decoder, kind: Literal["onnx", "torch_export"], path: Path) -> None:
-    """Writes a decoder as a function of points [B, N, 3] and codes [B, L] for any B and N >= 1.
+def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
+    """A decoder as a function of points [B, N, 3] and codes [B, L] for any B and N >= 1."""
+    example = (torch.zeros(2, 5, 3), torch.zeros(2, decoder.code_size))
+    batch, points = Dim("B", min=1), Dim("N", min=1)
+    shapes = {"points": {0: batch, 1: points}, "codes": {0: batch}}
+    with _quiet():
+        return torch.export.export(decoder, example, dynamic_shapes=shapes)
+
+
+def function_file(function: torch.export.ExportedProgram, kind: Literal["onnx", "torch_export"]) -> bytes:
+    """A function as the content of a file.
 
     Raises:
         SdfhubError: what this needs is not installed.
     """
-    example = (torch.zeros(2, 5, 3), torch.zeros(2, decoder.code_size))
-    batch, points = Dim("B", min=1), Dim("N", min=1)
-    shapes = {"points": {0: batch, 1: points}, "codes": {0: batch}}
     content = io.BytesIO()
     with _quiet():
-        program = torch.export.export(decoder, example, dynamic_shapes=shapes)
-        if kind == "onnx":
-            content.write(_onnx(program))
-        else:
-            torch.export.save(program, content)
-    write_whole(path, content.getvalue())
-
-
-def _onnx(program: torch.export.ExportedProgram) -> bytes:
-    try:
-        import onnxscript  # noqa: F401 - torch's own exporter is written in it
-    except ImportError as error:
-        raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-    names = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
-    made = torch.onnx.export(program, **names, dynamo=True, verbose=False)
-    return made.model_proto.SerializeToString()
+        if kind == "torch_export":
+            torch.export.save(function, content)
+            return content.getvalue()
+        try:
+            import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
+        except ImportError as error:
+            raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
+        names = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+        made = torch.onnx.export(function, **names, dynamo=True, verbose=False)
+        return made.model_proto.SerializeToString()
 
 
 @contextmanager

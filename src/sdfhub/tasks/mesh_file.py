@@ -27,7 +27,7 @@ def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
 
 
 def write_row(meshes: Sequence[Mesh], up: str, path: Path) -> None:
-    """Writes meshes side by side as one scene, upright in viewers, for which y is up; empty ones are left out.
+    """Writes meshes side by side as one scene, upright for viewers (+y up); empty ones are left out.
 
     Args:
         meshes: in the normalised frame.
@@ -38,10 +38,9 @@ def write_row(meshes: Sequence[Mesh], up: str, path: Path) -> None:
 
     scene = trimesh.Scene()
     for index, (vertices, faces) in enumerate(meshes):
-        upright = (
-            vertices if up == "y" else np.column_stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]])
-        )
         if len(faces):
+            x, y, z = vertices.T
+            upright = vertices if up == "y" else np.column_stack([x, z, -y])
             moved = trimesh.Trimesh(upright + [2.1 * index, 0, 0], faces, process=False)
             scene.add_geometry(moved, node_name=f"{index}")
     if scene.geometry:

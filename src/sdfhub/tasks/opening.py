@@ -47,25 +47,22 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")
     about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
+    where = _device(device)
     try:
         ids = tuple(about["ids"])
-        frames = {
-            id: Frame(np.array(four[:3], np.float64), float(four[3])) for id, four in about["frames"].items()
-        }
-        decoder = trained_decoder(about["config"]["decoder"], weights, path)
-        space = Space(
-            decoder=decoder.to(_device(device)).eval().requires_grad_(False),
-            codes=codes[: len(ids)].to(_device(device)),  # rows behind them are of augmented copies
+        frames = about["frames"].items()
+        return Space(
+            decoder=trained_decoder(about["config"]["decoder"], weights, path).to(where).eval(),
+            codes=codes[: len(ids)].to(where),  # rows behind them are of augmented copies
             ids=ids,
-            frames=frames,
+            frames={id: Frame(np.array(four[:3], np.float64), float(four[3])) for id, four in frames},
             up=about["up"],
             config=about["config"],
             metrics=about["metrics"],
             how_to_fit=default_fit(),
         )
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise SdfhubError(f"{path}: not a shape space that this version reads: {error}") from error
-    return space
 
 
 def trained_decoder(node: Mapping[str, Any], weights: Mapping[str, Tensor], path: Path) -> Decoder:
@@ -76,21 +73,25 @@ def trained_decoder(node: Mapping[str, Any], weights: Mapping[str, Tensor], path
             without bounds, so nothing is made before it is known that the weights are as many.
     """
     numbers = sum(weight.numel() for weight in weights.values())
-    for key, value in _integers(node, "decoder"):
+    for key, value in _numbers(node, "decoder"):
         if value > max(numbers, 64):
             raise SdfhubError(f"{path}: {key}={value} is more than a decoder of {numbers} weights can have")
-    with torch.device("meta"):
-        expected = build_decoder(node).state_dict()
-    for name in expected.keys() | weights.keys():
-        sizes = [list(part[name].shape) if name in part else "nothing" for part in (expected, weights)]
-        if sizes[0] != sizes[1]:
-            raise SdfhubError(
-                f"{path}: holds another model than its config says: {name}: {sizes[1]}, not {sizes[0]}"
-            )
+    try:
+        with torch.device("meta"):
+            expected = build_decoder(node).state_dict()
+    except SdfhubError as error:
+        raise SdfhubError(f"{path}: {error}") from error
+    except (RuntimeError, TypeError, AttributeError, ArithmeticError) as error:
+        raise SdfhubError(f"{path}: its config describes no decoder: {error}") from error
+    for name in sorted(expected.keys() | weights.keys()):
+        wanted, got = (list(part[name].shape) if name in part else "nothing" for part in (expected, weights))
+        if wanted != got:
+            what = f"{name}: {got}, not {wanted}"
+            raise SdfhubError(f"{path}: holds another model than its config says: {what}")
     with torch.random.fork_rng(devices=[]):  # weights are drawn, though only to be replaced
         decoder = build_decoder(node)
     put_weights(decoder, weights, path)
-    return decoder
+    return decoder.requires_grad_(False)
 
 
 def default_fit() -> Fit:
@@ -100,7 +101,7 @@ def default_fit() -> Fit:
 
 
 def beside(run: str, out: str | None, name: str) -> Path:
-    """The folder of a task's results: `out`, or one named for the task in the run's folder or beside its file."""
+    """The folder of a task's results: `out`, or one in the run's folder or beside its file."""
     return Path(out) if out else (Path(run) if Path(run).is_dir() else Path(run).parent) / name
 
 
@@ -144,10 +145,8 @@ def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
-                found = metadata.get("format", "an unknown one")
-                raise SdfhubError(
-                    f"{path}: of the format {found!r:.60}, not {FORMAT!r}: export the run again"
-                )
+                found = repr(metadata.get("format", "unknown"))[:60]
+                raise SdfhubError(f"{path}: its format is {found}, not {FORMAT!r}: export the run again")
             about = json.loads(metadata["about"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         codes = tensors.pop("codes")
@@ -159,13 +158,14 @@ def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
         raise SdfhubError(f"{path}: not a readable export; give a file that `sdfhub export` wrote") from error
 
 
-def _integers(node: Any, key: str) -> Iterator[tuple[str, int]]:
+def _numbers(node: Any, key: str) -> Iterator[tuple[str, float]]:
+    """Every number of a plain node, with its dotted key."""
     if isinstance(node, Mapping):
         for name, value in node.items():
-            yield from _integers(value, f"{key}.{name}")
+            yield from _numbers(value, f"{key}.{name}")
     elif isinstance(node, list):
         for value in node:
-            yield from _integers(value, key)
+            yield from _numbers(value, key)
     elif isinstance(node, int | float) and not isinstance(node, bool):
         yield key, node
 
