@@ -20,6 +20,7 @@ from sdfhub.data.procedural import generate
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
+from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate_run
 from sdfhub.tasks.run import build_autodecoder, read_weights
 from tests.test_config import composed
@@ -189,10 +190,12 @@ def test_a_trained_run_opens_as_a_space_with_the_frames_of_its_shapes(trained):
     known = json.loads((folder / "split.json").read_text())["train"]
     assert space.ids == tuple(known) and set(space.frames) == set(known) and space.up == "z"
     assert space.metrics["known"]["summary"]["failed"] == 0
-    vertices, _ = space.mesh(known[0], resolution=48)
-    category, index = known[0].split("/")
-    truth = generate(category, int(index))[0]
-    assert np.allclose(vertices.max(0), truth.max(0), atol=0.1 * np.ptp(truth))
+    for id, frame in space.frames.items():
+        category, index = id.split("/")
+        truth = generate(category, int(index))[0]
+        normalised = frame.to_normalized(truth)
+        assert np.allclose(normalised.min(0), -normalised.max(0)), "the bounding box is centred"
+        assert np.isclose(np.linalg.norm(normalised, axis=1).max(), RADIUS)
 
 
 def test_evaluate_without_a_run_says_so(tmp_path):
