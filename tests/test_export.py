@@ -156,6 +156,13 @@ def test_a_mistake_is_one_line_that_names_it(run, monkeypatch, capsys, task, wor
     assert message in told(monkeypatch, capsys, task, f"run={run}", *words, expect=2)
 
 
+@pytest.mark.parametrize("task", [export, interpolate, sample, neighbours])
+def test_help_is_the_tasks_own_keys_and_what_they_mean(task, monkeypatch, capsys):
+    printed = told(monkeypatch, capsys, task, "--help")
+    assert "\nrun: ??? # folder of a run" in printed and "out: null # " in printed
+    assert "hydra" not in printed.lower() and "activation" not in printed
+
+
 def test_a_missing_run_is_named(monkeypatch, capsys, tmp_path):
     for folder, message in ((tmp_path / "nowhere", "no such run or file"), (tmp_path, "not a run's folder")):
         assert message in told(monkeypatch, capsys, sample, f"run={folder}", expect=2)

@@ -39,6 +39,9 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
     line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
     """
+    if {"-h", "--help"} & set(sys.argv[1:]) and not _composed_groups(config_name):
+        print(help_of(config_name))
+        return
     failures: list[Exception] = []
     verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
     register_resolvers()
@@ -73,6 +76,12 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
         print(f"sdfhub: error: {one_line(error, config_name)}", file=sys.stderr)
     if failures:
         sys.exit(2)
+
+
+def help_of(config_name: str) -> str:
+    """What a task without groups can be given: its YAML, whose comments say so, less what is Hydra's."""
+    text = (configuration_folder() / f"{config_name}.yaml").read_text(encoding="utf-8")
+    return re.sub(r"^(defaults|hydra):\n(?:[ ].*\n?|\n)*", "", text, flags=re.MULTILINE).rstrip()
 
 
 def first_word_as(key: str) -> None:
@@ -126,9 +135,14 @@ def _no_such_key(key: str, config_name: str = "config") -> str:
 def _top_level_keys(config_name: str) -> list[str]:
     """What a task's own config can be given: its keys and the groups that it composes."""
     node = _yaml(configuration_folder() / f"{config_name}.yaml")
-    composed = [group for entry in node["defaults"] if isinstance(entry, dict) for group in entry]
-    groups = [group.removeprefix("override ") for group in composed if "hydra" not in group]
-    return list(dict.fromkeys([*(key for key in node if key not in ("defaults", "hydra")), *groups]))
+    keys = [key for key in node if key not in ("defaults", "hydra")]
+    return list(dict.fromkeys([*keys, *_composed_groups(config_name)]))
+
+
+def _composed_groups(config_name: str) -> list[str]:
+    defaults = _yaml(configuration_folder() / f"{config_name}.yaml")["defaults"]
+    composed = [group for entry in defaults if isinstance(entry, dict) for group in entry]
+    return [group.removeprefix("override ") for group in composed if "hydra" not in group]
 
 
 def _groups() -> list[str]:
