@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import sdfhub
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.names import cell_name, run_name, sweep_name
+from sdfhub.tasks.names import cell_name, run_name, run_stamp, sweep_name
 
 TASK_CONFIGS = ("config.yaml", "evaluate.yaml", "report.yaml")
 """Configs whose top-level keys tasks read."""
@@ -30,7 +30,7 @@ def configuration_folder() -> Path:
 
 def register_resolvers() -> None:
     """Makes the names of folders and `${unique:}` known to the configs."""
-    for name in (run_name, sweep_name, cell_name):
+    for name in (run_name, run_stamp, sweep_name, cell_name):
         OmegaConf.register_new_resolver(name.__name__, name, replace=True)
     # two runs that start in one second must not share a folder
     OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)

@@ -7,8 +7,6 @@ metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 """
 
 import json
-import os
-import uuid
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +17,14 @@ from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.codes import CodeTable
 from sdfhub.tasks.build import build
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file whole or not at all: beside its place, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+from sdfhub.tasks.checkpoint import LAST, read_checkpoint
+from sdfhub.whole_file import write_whole
 
 
 def begin_run(run: Path, config: dict[str, Any], train: list[str], held_out: list[str]) -> None:
     """Writes down what a run is made of, before it starts."""
-    write_text(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
-    write_text(run / "split.json", json.dumps({"train": train, "held_out": held_out}, indent=1))
+    write_whole(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_whole(run / "split.json", json.dumps({"train": train, "held_out": held_out}, indent=1))
 
 
 def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
@@ -93,20 +79,16 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
     """The `state_dict` of a checkpoint, on the CPU. Runs no code of it.
 
     Raises:
-        SdfhubError: no such file, or not a checkpoint of an auto-decoder.
+        SdfhubError: no such file, a damaged one, or not a checkpoint of an auto-decoder.
     """
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-        weights["codes.table"].shape  # noqa: B018 - anything else is not ours
-    except FileNotFoundError as error:
-        raise SdfhubError(
-            f"{path}: there is no such checkpoint; a run keeps checkpoints/last.ckpt"
-        ) from error
-    except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
-        raise SdfhubError(
-            f"{path}: not a readable checkpoint of an auto-decoder; give one that training wrote, "
-            "such as RUN/checkpoints/last.ckpt"
-        ) from error
+    content = read_checkpoint(path)
+    weights = content.get("state_dict") if isinstance(content, dict) else None
+    # a view may claim more numbers than its file holds
+    is_ours = isinstance(weights, dict) and all(
+        isinstance(weight, torch.Tensor) and weight.is_contiguous() for weight in weights.values()
+    )
+    if not is_ours or getattr(weights.get("codes.table"), "ndim", 0) != 2:
+        raise SdfhubError(f"{path}: not a checkpoint of an auto-decoder; a run keeps checkpoints/{LAST}")
     return weights
 
 
@@ -129,7 +111,7 @@ def load_autodecoder(run: Path, config: dict[str, Any]) -> AutoDecoder:
     Raises:
         SdfhubError: no readable checkpoint, or one of another model.
     """
-    path = run / "checkpoints" / "last.ckpt"
+    path = run / "checkpoints" / LAST
     weights = read_weights(path)
     model = build_autodecoder(config, rows=len(weights["codes.table"]))
     put_weights(model, weights, path)

@@ -20,7 +20,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.callbacks import LossBar, TrainingRecord
-from sdfhub.tasks.cells import run_cell
+from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.names import flat
@@ -65,8 +65,6 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
     trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
     if not trainer.is_global_zero:
         return {}
     training = parts.record.summary(model)
@@ -184,6 +182,8 @@ def main() -> None:
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
     # a continued run has a folder of its own
     warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
+    # our loader starts from the step that a checkpoint ends with, in the middle of an epoch too
+    warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
@@ -193,6 +193,6 @@ def main() -> None:
         elif name := hydra.runtime.choices.get("sweeps"):
             raise SdfhubError(f"sweeps={name}: is a table of runs; add -m")
         else:
-            train(plain(config), Path(hydra.runtime.output_dir))
+            go_on(train, plain(config), Path(hydra.runtime.output_dir))
 
     run_task(task, "config")

@@ -17,7 +17,9 @@ from sdfhub.shapes import ShapeSamples
 Triangles = tuple[np.ndarray, np.ndarray]
 """vertices [V, 3] float64 and faces [F, 3] int64 in the source's own frame."""
 
-_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}\Z")
+_PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
+SHAPE_ID = rf"^{_PART}(/{_PART})*$"
+"""What may name a shape: safe as a folder's path, none that leads out of it."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Shape:
     credits: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
-        if not all(_PART.match(part) for part in self.id.split("/")):
+        if not re.fullmatch(SHAPE_ID, self.id):
             raise ValueError(f"shape id {self.id!r}: parts must be letters, digits or _ . + -")
 
 
