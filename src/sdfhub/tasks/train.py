@@ -12,6 +12,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
+from pydantic import PositiveInt
 from torch import Tensor
 
 from sdfhub.data.batches import Loading
@@ -97,7 +98,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     config["seed"] = check(config["seed"], int, "seed")
     resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
     every = {
-        key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
+        key: check(value, PositiveInt | None, f"checkpoint.{key}")
+        for key, value in config["checkpoint"].items()
     }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
     weights = read_weights(resume_from) if resume_from else None
@@ -108,7 +110,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     training_steps(config["trainer"], 1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
-    watched = config["trainer"].get("enable_progress_bar", True) and sys.stdout.isatty()
+    bar = check(config["trainer"].get("enable_progress_bar", True), bool, "trainer.enable_progress_bar")
+    watched = bar and sys.stdout.isatty()
     if watched:  # in a file a bar is ten thousand lines
         callbacks.append(LossBar())
     return Parts(
