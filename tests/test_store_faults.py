@@ -155,6 +155,16 @@ def changed(manifest: dict, *path: str, value) -> dict:
     return manifest
 
 
+@pytest.mark.parametrize("place", [8, 30, 60])
+def test_an_array_whose_header_is_damaged_is_named(place, tmp_path):
+    prepared = fill(tmp_path, Balls(1))
+    path = prepared.folder / "balls/0000/outside.npy"
+    content = path.read_bytes()
+    path.write_bytes(content[:place] + b'\0"(' + content[place + 3 :])
+    with pytest.raises(SdfhubError, match=r"outside\.npy"):
+        prepared["balls/0000"].read("outside", 0, 5)
+
+
 FORGERIES = {
     "an id that leads out": lambda m: changed(m, "shapes", "../../victim", value=m["shapes"]["balls/0000"]),
     "an absolute id": lambda m: changed(m, "shapes", "/etc/victim", value=m["shapes"]["balls/0000"]),
