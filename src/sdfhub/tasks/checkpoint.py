@@ -4,6 +4,7 @@ import io
 import os
 import signal
 import subprocess
+import threading
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -83,15 +84,20 @@ class KeepLast(L.Callback):
         self._told: int | None = None
         self._before: dict[int, Any] = {}
 
-    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def setup(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
         self._told = None
+        self._listen()
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._listen()  # again: Lightning has put its own handlers there meanwhile
+
+    def _listen(self) -> None:
         listened = [signal.SIGTERM, signal.SIGINT]
         if "SLURM_JOB_ID" in os.environ:
             listened.append(signal.SIGUSR1)
-        try:
-            self._before = {number: signal.signal(number, self._tell) for number in listened}
-        except ValueError:  # not the main thread: a notebook's or a launcher's own business
-            self._before = {}
+        if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
+            before = {number: signal.signal(number, self._tell) for number in listened}
+            self._before = self._before or before
 
     def _tell(self, number: int, frame: Any) -> None:
         if self._told is not None:
@@ -112,8 +118,10 @@ class KeepLast(L.Callback):
         raise SystemExit(128 + number)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        self._stop_listening()
         trainer.save_checkpoint(self.path)  # the last epoch need not have been one of every_n_epochs
+
+    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        self._stop_listening()
         if self._told is not None:
             raise SystemExit(128 + self._told)
 

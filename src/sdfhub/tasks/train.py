@@ -26,6 +26,7 @@ from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.names import flat
 from sdfhub.tasks.prepare import prepare_data
+from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
@@ -65,7 +66,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     begin_run(run, config, [shape.id for shape in prepared.train], [shape.id for shape in prepared.held_out])
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
-    trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+    with ending_together(trainer):
+        trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
     if not trainer.is_global_zero:
         return {}
     training = parts.record.summary(model)
