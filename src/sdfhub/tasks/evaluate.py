@@ -29,7 +29,7 @@ from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.prepare import prepare_split
-from sdfhub.tasks.run import load_autodecoder, read_run
+from sdfhub.tasks.run import load_autodecoder, read_run, refuse_unwritable
 from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
 
 WORTH_A_PROCESS = 4
@@ -198,10 +198,11 @@ def distance_errors(
 def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     """Judges a finished run again, as `config` says, into `out` or a folder `evaluation` of the run."""
     run = Path(check(config["run"], str, "run"))
-    out = check(config["out"], str | None, "out")
+    out = check(config["out"], Path | None, "out") or run / "evaluation"
     evaluation = build(config["evaluate"], "evaluate")
     trained, roles_then = read_run(run)
     model = load_autodecoder(run, trained)
+    refuse_unwritable(out)
     data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
     then = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
@@ -213,9 +214,7 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     prepared = prepare_split(source, roles, preparation, data)
     known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
-    return evaluate_model(
-        model, known, prepared.held_out, evaluation, Path(out) if out else run / "evaluation"
-    )
+    return evaluate_model(model, known, prepared.held_out, evaluation, out)
 
 
 def choose_shapes(

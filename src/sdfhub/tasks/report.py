@@ -18,6 +18,7 @@ from sdfhub.report.rows import Group, group_cells
 from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.run import refuse_unwritable
 from sdfhub.whole_file import write_whole
 
 
@@ -81,7 +82,9 @@ def report(config: dict[str, Any]) -> None:
     shapes = check(config["shapes"], int, "shapes")
     if shapes < 1:
         raise SdfhubError(f"shapes={shapes}: must be at least 1")
-    write_report(sweep, Path(out) if out else sweep / "report", shapes)
+    folder = Path(out) if out else sweep / "report"
+    refuse_unwritable(folder)
+    write_report(sweep, folder, shapes)
 
 
 def main() -> None:

@@ -7,6 +7,7 @@ metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 """
 
 import json
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,19 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.tasks.build import build
 from sdfhub.tasks.checkpoint import LAST, read_checkpoint
 from sdfhub.whole_file import write_whole
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """Makes a folder of results, before hours go into what should lie there.
+
+    Raises:
+        SdfhubError: nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise SdfhubError(f"{folder}: cannot be written ({(error.strerror or '').lower()})") from error
 
 
 def begin_run(run: Path, config: dict[str, Any], train: list[str], held_out: list[str]) -> None:

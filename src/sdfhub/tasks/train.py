@@ -27,7 +27,14 @@ from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.names import flat
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.processes import ending_together
-from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
+from sdfhub.tasks.run import (
+    begin_run,
+    build_autodecoder,
+    put_weights,
+    read_run,
+    read_weights,
+    refuse_unwritable,
+)
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
 FREE_TO_CHANGE += ("computing.", "data.workers", "data.loader.workers", "data.loader.resident")
@@ -58,6 +65,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     parts = build_parts(config, run)
     if parts.loading.surface_per_shape:
         refuse_missing_normals(config["data"])
+    refuse_unwritable(run)
     prepared = prepare_data(config["data"])
     loader = SdfDataModule(prepared.train, parts.loading)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
