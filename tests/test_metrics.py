@@ -6,8 +6,10 @@ import time
 import igl
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from sdfhub.geometry.mesher import mesh_dense
 from sdfhub.geometry.metrics import (
     chamfer,
     is_closed,
@@ -174,9 +176,23 @@ def test_a_failure_is_a_row(case):
     }[case]
     row = judge(mesh, truth(icosphere()), points=2000)
     assert row.failed and row.vertices == len(mesh[0])
-    kept = {"failed", "vertices", "faces", "floor", "cd_penalty"}
+    kept = {"failed", "vertices", "faces", "pieces", "floor", "cd_penalty"}
     assert all(v is None for k, v in dataclasses.asdict(row).items() if k not in kept)
     assert row.cd_penalty == pytest.approx(2 * 0.6**2, rel=0.01)
+
+
+def crumbs(points: torch.Tensor, side: int = 22) -> torch.Tensor:
+    """A field of side^3 balls that float apart."""
+    cell = (points + 1) * side / 2
+    return ((cell - cell.floor() - 0.5).norm(dim=-1) - 0.3) * 2 / side
+
+
+def test_ten_thousand_floating_pieces_are_counted_and_judged():
+    mesh = mesh_dense(crumbs, resolution=89)
+    row = judge(mesh, truth(icosphere()), points=2000)
+    assert row.pieces == 22**3 and np.isfinite(row.cd) and not row.failed
+    assert judge(icosphere(), truth(icosphere()), points=500).pieces == 1
+    assert summarize([row])["pieces"]["mean"] == 22**3
 
 
 def test_summary_counts_failures_and_says_how_they_enter():

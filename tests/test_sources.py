@@ -4,6 +4,8 @@ import io
 import json
 import os
 import pickle
+import random
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -14,6 +16,8 @@ import trimesh
 from sdfhub.data import procedural
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.sources import DeepSdfSource, FolderSource, OpenSource, ProceduralSource, ShapeNetSource
+from sdfhub.data.sources.deepsdf import read_samples
+from sdfhub.data.sources.source import Shape
 from sdfhub.data.store import prepare
 from sdfhub.errors import RejectedMesh, SdfhubError
 from tests.categories import CATEGORIES
@@ -198,6 +202,63 @@ def test_deepsdf_believes_no_claims(tmp_path):
         archive.writestr("pos.npy", header.getvalue())
     with pytest.raises(RejectedMesh, match="corrupt_file"):
         source.load(source.shapes()[0])
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_no_flipped_bit_of_deepsdfs_samples_is_taken(compressed, tmp_path):
+    rows = np.random.default_rng(0).uniform(0.1, 0.5, (100, 4)).astype(np.float32)
+    path, chance = tmp_path / "a.npz", random.Random(0)
+    (np.savez_compressed if compressed else np.savez)(path, pos=rows, neg=rows * [1, 1, 1, -1])
+    whole, refused = path.read_bytes(), 0
+    points = read_samples(path).points
+    for _ in range(200):
+        broken, bit = bytearray(whole), chance.randrange(8 * len(whole))
+        broken[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(broken)
+        try:
+            assert np.array_equal(read_samples(path).points, points)  # a date, a flag without a meaning
+        except RejectedMesh as rejection:
+            refused += 1
+            assert "a.npz" in str(rejection)
+    assert refused > 100
+
+
+@pytest.mark.parametrize("shape", [(-1, 4), (10**13, 4), (3, 10**30)])
+def test_shapes_that_no_array_has_are_refused(shape, tmp_path):
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("pos.npy", header.getvalue() + bytes(1000))
+    with pytest.raises(RejectedMesh, match="corrupt_file"):
+        read_samples(tmp_path / "a.npz")
+
+
+def test_a_header_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path):
+    claim = b"\x93NUMPY\x02\x00" + (1 << 31).to_bytes(4, "little") + b" " * (64 << 20)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("pos.npy", claim)
+    tracemalloc.start()
+    with pytest.raises(RejectedMesh, match="corrupt_file"):
+        read_samples(tmp_path / "a.npz")
+    assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    tracemalloc.stop()
+
+
+def test_samples_whose_frame_has_changed_are_other_samples(tmp_path):
+    samples_file(tmp_path / "SdfSamples/d/c/aa.npz")
+    frame = tmp_path / "NormalizationParameters/d/c/aa.npz"
+    samples_file(frame, offset=np.zeros(3), scale=np.ones(1))
+    before = DeepSdfSource(str(tmp_path)).shapes()[0].fingerprint
+    samples_file(frame, offset=np.ones(3), scale=np.ones(1))
+    assert DeepSdfSource(str(tmp_path)).shapes()[0].fingerprint != before
+
+
+@pytest.mark.parametrize(
+    "id", ["../a", "/a", "a/../b", "a//b", "a/", ".a", "a/.b", "a b", "a\nb", "a/b\n", "ä", ""]
+)
+def test_an_id_that_is_no_safe_path_is_refused(id):
+    with pytest.raises(ValueError, match="shape id"):
+        Shape(id, "chairs", "v1")
 
 
 def test_deepsdf_samples_go_into_the_store(tmp_path):

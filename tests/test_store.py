@@ -3,12 +3,14 @@
 import dataclasses
 import os
 import pickle
+import shutil
 import time
 
 import numpy as np
 import pytest
 
 from sdfhub.data import shards, store
+from sdfhub.data.manifest import read_manifest, write_manifest
 from sdfhub.data.sampling import Preparation
 from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.store import Store, prepare
@@ -175,11 +177,12 @@ def test_a_killed_run_keeps_whole_shapes_only(tmp_path, monkeypatch):
 
 def test_leftovers_of_killed_runs_go_away(tmp_path):
     folder = fill(tmp_path, Balls(1)).folder
-    for name, age in ((".old.1", 9999), (".new.1", 0)):
+    new, old = ".0001.0123456789ab", ".0002.0123456789ab.old"
+    for name, age in ((old, 9999), (new, 0)):
         (folder / "balls" / name).mkdir()
         os.utime(folder / "balls" / name, (time.time() - age,) * 2)
     fill(tmp_path, Balls(2))
-    assert [path.name for path in (folder / "balls").glob(".*")] == [".new.1"]
+    assert [path.name for path in (folder / "balls").glob(".*")] == [new]
 
 
 def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
@@ -238,11 +241,13 @@ def test_empty_arrays_have_their_columns(tmp_path, monkeypatch):
 
 def test_a_thousand_shapes_open_fast(tmp_path):
     prepared = fill(tmp_path, Balls(1))
-    manifest = store._read_manifest(prepared.folder)
+    manifest = read_manifest(prepared.folder)
     record = manifest["shapes"]["balls/0000"]
     source = Balls(1000)
+    for shape in source.listed[1:]:
+        shutil.copytree(prepared.folder / "balls/0000", prepared.folder / shape.id, copy_function=os.link)
     manifest["shapes"] = {shape.id: record | {"fingerprint": shape.fingerprint} for shape in source.listed}
-    store._write_manifest(prepared.folder, manifest)
+    write_manifest(prepared.folder, manifest)
     start = time.perf_counter()
     many = fill(tmp_path, source)
     assert len(many) == 1000 and time.perf_counter() - start < 2
@@ -267,6 +272,6 @@ def _is_shard(descriptor: str) -> bool:
 
 def test_manifest_lists_authors_and_settings(tmp_path):
     prepared = fill(tmp_path, Balls(3))
-    manifest = store._read_manifest(prepared.folder)
+    manifest = read_manifest(prepared.folder)
     assert manifest["credits"] == [{"author": "A", "licence": "B", "shapes": 3}]
     assert manifest["preparation"] and manifest["version"] == store.VERSION

@@ -13,7 +13,9 @@ import torch
 RADIUS = 1 / 1.03
 """Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
 
-_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}\Z")
+_PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
+SHAPE_ID = rf"^{_PART}(/{_PART})*$"
+"""What may name a shape: safe as a path below a folder, none that leads out of it."""
 
 
 def check_id(id: str) -> None:
@@ -22,7 +24,7 @@ def check_id(id: str) -> None:
     Raises:
         ValueError: says what an id may hold.
     """
-    if not isinstance(id, str) or not all(_PART.match(part) for part in id.split("/")):
+    if not isinstance(id, str) or not re.fullmatch(SHAPE_ID, id):
         raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
 
 

@@ -12,7 +12,7 @@ from sdfhub.errors import SdfhubError
 
 
 class EpochSteps(Sampler[int]):
-    """The step numbers of one epoch: those that follow the steps already done.
+    """The step numbers of one epoch that are still to be done: after a resume, a part of them.
 
     Lightning's own `set_epoch` comes too early after a resume: it starts again at epoch 0.
 
@@ -28,8 +28,8 @@ class EpochSteps(Sampler[int]):
         return self.steps
 
     def __iter__(self) -> Iterator[int]:
-        first = self.done() // self.steps * self.steps
-        return iter(range(first, first + self.steps))
+        done = self.done()
+        return iter(range(done, (done // self.steps + 1) * self.steps))
 
 
 class SdfDataModule(L.LightningDataModule):

@@ -53,14 +53,40 @@ def triangles_of(
         line = bad[0].strip().decode(errors="replace")
         raise RejectedMesh("non_finite_vertices", f"{name} has the line {line!r}")
     try:
+        _check_length(content, suffix)
         vertices, faces = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
     except RejectedMesh as rejection:
         raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
     except Exception as error:  # trimesh raises whatever the broken bytes lead to
-        what = f"{name} cannot be read as {suffix[1:]} ({type(error).__name__}: {error})"
-        raise RejectedMesh("corrupt_file", what) from error
+        is_foreign = isinstance(error, ImportError)  # it would guess at the encoding of what is no text
+        why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
+        raise RejectedMesh("corrupt_file", f"{name} cannot be read as {suffix[1:]} ({why})") from error
     _check_triangles(vertices, faces, name)
     return vertices, faces
+
+
+def _check_length(content: bytes, suffix: str) -> None:
+    """Refuses files that end before all that their header promises; trimesh takes what there is."""
+    promised, held = 0, len(content)
+    if suffix == ".glb":
+        promised = int.from_bytes(content[8:12], "little")
+    elif suffix == ".stl" and not content.lstrip().startswith(b"solid"):
+        promised = 84 + 50 * int.from_bytes(content[80:84], "little")
+    elif suffix == ".ply" and b"\nformat ascii" in content[:1000]:
+        head, _, body = content.partition(b"end_header")
+        promised = sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE)))
+        held = _lines(body)
+    elif suffix == ".off":
+        counts = re.match(rb"(?:\s|#.*)*OFF(?:\s|#.*)+(\d+)\s+(\d+)(?:[ \t]+\d+)?", content)
+        promised = sum(map(int, counts.groups())) if counts else 0
+        held = _lines(content[counts.end() :]) if counts else 0
+    if promised > held:
+        raise RejectedMesh("corrupt_file", f"ends too early: its header promises {promised}, it holds {held}")
+
+
+def _lines(body: bytes) -> int:
+    """Lines with something on them."""
+    return sum(1 for line in body.splitlines() if line.strip())
 
 
 def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """One prepared shape on disk: a folder of memory-mapped arrays, there whole or not at all."""
 
-import hashlib
 import json
 import os
+import re
 import shutil
 import time
 import uuid
@@ -12,8 +12,10 @@ from typing import Literal
 
 import numpy as np
 
+from sdfhub.data.manifest import Record, StoredFile, checked_record
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.whole_file import file_sha256, whole_file, write_whole
 
 COLUMNS = {"outside": 4, "inside": 4, "surface": 6, "vertices": 3, "faces": 3}
 """Columns of each array: (x, y, z, sdf) twice, (point, normal), position, vertex indices."""
@@ -21,6 +23,8 @@ COLUMNS = {"outside": 4, "inside": 4, "surface": 6, "vertices": 3, "faces": 3}
 DTYPES = {"outside": "<f4", "inside": "<f4", "surface": "<f4", "vertices": "<f8", "faces": "<i4"}
 
 RECORD = "shape.json"
+
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{12}(\.old)?")
 
 
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
@@ -56,7 +60,7 @@ def write_shape(folder: Path, arrays: Mapping[str, np.ndarray], record: dict) ->
     try:
         files = {name: _write_array(beside / f"{name}.npy", array) for name, array in arrays.items()}
         record = record | {"files": files}
-        _write_synced(beside / RECORD, json.dumps(record, indent=1).encode())
+        write_whole(beside / RECORD, json.dumps(record, indent=1))
         _put_in_place(beside, folder)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
@@ -66,52 +70,36 @@ def write_shape(folder: Path, arrays: Mapping[str, np.ndarray], record: dict) ->
 def remove_leftovers(store: Path) -> None:
     """Removes the half-written shapes of runs that were killed more than an hour ago."""
     for leftover in store.glob("*/.*"):
-        if time.time() - leftover.stat().st_mtime > 3600:
+        is_ours = _LEFTOVER.fullmatch(leftover.name) and not leftover.parent.is_symlink()
+        if is_ours and time.time() - leftover.lstat().st_mtime > 3600:
             shutil.rmtree(leftover, ignore_errors=True)
 
 
 def read_record(folder: Path) -> dict | None:
-    """The record of a shape whose files all have their full length, or None."""
-    try:
-        record = json.loads((folder / RECORD).read_text())
-        whole = all(
-            (folder / f"{name}.npy").stat().st_size == file["bytes"] for name, file in record["files"].items()
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return record if whole else None
+    """The record of a shape whose files all are as they were written, or None."""
+    record = checked_record(folder / RECORD)
+    return None if record is None or damaged_files(folder, record) else record
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file beside its place, then renames it: a reader sees the old or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
+def damaged_files(folder: Path, record: Mapping) -> list[str]:
+    """Names of a shape's files whose content no longer has its recorded sha256; reads all of them."""
+    return [name for name, file in record.get("files", {}).items() if not _is_intact(folder, name, file)]
+
+
+def _is_intact(folder: Path, name: str, file: StoredFile) -> bool:
+    path = folder / f"{name}.npy"
     try:
-        _write_synced(beside, content)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+        return path.stat().st_size == file["bytes"] and file_sha256(path) == file["sha256"]
+    except OSError:
+        return False
 
 
 def _write_array(path: Path, array: np.ndarray) -> dict:
-    with path.open("wb") as file:
-        np.save(file, array, allow_pickle=False)
-        file.flush()
-        os.fsync(file.fileno())
+    with whole_file(path) as file:
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(array.data)  # np.save writes the same, but on a full disk does not say so
     return {"rows": len(array), "bytes": path.stat().st_size, "sha256": file_sha256(path)}
-
-
-def file_sha256(path: Path) -> str:
-    """Hex sha256 of a file's content."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _write_synced(path: Path, content: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _put_in_place(beside: Path, folder: Path) -> None:
@@ -139,7 +127,7 @@ class StoredShape:
         up: the axis that points up in the source's frame, for pictures.
     """
 
-    def __init__(self, id: str, folder: Path, record: dict, up: Literal["y", "z"] = "z"):
+    def __init__(self, id: str, folder: Path, record: Record, up: Literal["y", "z"] = "z"):
         self.id = id
         self.folder, self.up = folder, up
         self.category: str = record["category"]
@@ -149,7 +137,7 @@ class StoredShape:
         self.scale = float(record["scale"])
         self.statistics: dict[str, float] = record["statistics"]
         self.seconds = float(record["seconds"])
-        self._files: dict[str, dict] = record["files"]
+        self._files: dict[str, StoredFile] = record["files"]
         self._offsets: dict[str, int] = {}  # of arrays whose header has been checked
 
     @property
@@ -201,13 +189,7 @@ class StoredShape:
 
     def damaged(self) -> list[str]:
         """Names of the files whose content no longer has its recorded sha256; reads all of them."""
-        return [name for name, file in self._files.items() if not self._is_intact(name, file["sha256"])]
-
-    def _is_intact(self, name: str, sha256: str) -> bool:
-        try:
-            return file_sha256(self.folder / f"{name}.npy") == sha256
-        except OSError:
-            return False
+        return damaged_files(self.folder, {"files": self._files})
 
     def _map(self, name: str) -> np.ndarray:
         rows, path = self.rows(name), self.folder / f"{name}.npy"
@@ -218,7 +200,7 @@ class StoredShape:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
             if array.shape != shape or array.dtype != np.dtype(DTYPES[name]) or np.isfortran(array):
                 raise ValueError(f"holds {list(array.shape)} {array.dtype}")
-        except (OSError, ValueError, EOFError) as error:
+        except Exception as error:  # numpy parses a header as Python, and a damaged one in many ways
             raise self._broken(name, error) from error
         self._offsets[name] = array.offset
         return array
@@ -227,5 +209,5 @@ class StoredShape:
         shape = [self.rows(name), COLUMNS[name]]
         return SdfhubError(
             f"{self.folder / name}.npy: not the {shape} {DTYPES[name]} array that was prepared ({error}); "
-            f"delete {self.folder} and the store's manifest.json, then prepare again"
+            "start or prepare again: what is damaged is then made anew"
         )

@@ -15,6 +15,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,7 @@ from typing import Literal
 from tqdm import tqdm
 
 from sdfhub.data import shards
+from sdfhub.data.manifest import MANIFEST, VERSION, enter, new_manifest, read_manifest, write_manifest
 from sdfhub.data.sampling import Preparation, prepare_mesh
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources.source import Shape, Source
@@ -29,10 +31,6 @@ from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import ShapeSamples
 
-VERSION = 2
-"""Of the layout on disk and of how samples are made; stores of another version are not reused."""
-
-MANIFEST = "manifest.json"
 PASSING = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
 
@@ -63,7 +61,7 @@ class Store:
         Raises:
             SdfhubError: no readable manifest there, or a shape that was never prepared.
         """
-        manifest = _read_manifest(Path(root))
+        manifest = read_manifest(Path(root))
         if manifest is None:
             raise SdfhubError(f"{root}: holds no {MANIFEST} of version {VERSION}; run `sdfhub prepare` first")
         everything = sorted(manifest["shapes"] | manifest["rejected"])
@@ -112,8 +110,9 @@ def prepare(
 ) -> Store:
     """The store holding `shapes`, preparing those that it lacks.
 
-    A shape is prepared again when its fingerprint, the preparation or VERSION changes. Its randomness
-    derives from its id and fingerprint, so neither the order nor the number of workers matters.
+    A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its files are no
+    longer those that were written: each is read once and its checksum compared. Its randomness derives
+    from its id and fingerprint, so neither the order nor the number of workers matters.
 
     Args:
         source: picklable; loads the shapes.
@@ -127,11 +126,12 @@ def prepare(
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
-    manifest = _read_manifest(folder) or _new_manifest(source, preparation)
-    if _missing(shapes, manifest):
+    manifest = read_manifest(folder) or new_manifest(source.name, preparation)
+    damaged = _damaged(shapes, manifest, folder)
+    if damaged or _missing(shapes, manifest):
         try:
             with _locked(folder):
-                manifest = _fill(source, shapes, preparation, folder, workers, progress)
+                manifest = _fill(source, shapes, preparation, folder, workers, progress, damaged)
         except OSError as error:
             raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
     store = Store(folder, manifest, [shape.id for shape in shapes], source.up)
@@ -190,13 +190,16 @@ class _PrepareShape:
         return prepare_shape(self.source, shape, self.preparation, self.folder)
 
 
-def _fill(source, shapes, preparation, folder, workers, progress) -> dict:
+def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> dict:
+    _refuse_detours(shapes, folder)
     shards.remove_leftovers(folder)
-    manifest = _read_manifest(folder) or _new_manifest(source, preparation)
+    manifest = read_manifest(folder) or new_manifest(source.name, preparation)
+    for id in damaged:
+        manifest["shapes"].pop(id, None)
     for shape in _missing(shapes, manifest):
         record = shards.read_record(folder / shape.id)
         if record:
-            _enter(manifest, shape, record)
+            enter(manifest, shape.id, record)
     left = _missing(shapes, manifest)
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
     function = _PrepareShape(source, preparation, folder)
@@ -209,9 +212,9 @@ def _fill(source, shapes, preparation, folder, workers, progress) -> dict:
     try:
         for index, record in bar:
             is_crash = isinstance(record, Crashed)
-            _enter(manifest, left[index], _crash_record(left[index]) if is_crash else record)
+            enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
     finally:  # a run that is interrupted keeps what it has
-        _write_manifest(folder, manifest)
+        write_manifest(folder, manifest)
     return manifest
 
 
@@ -219,6 +222,25 @@ def _crash_record(shape: Shape) -> dict:
     detail = "the worker process died: out of memory, or a fault in a native library"
     refusal = {"reason": "crash", "detail": detail}
     return {"fingerprint": shape.fingerprint, "category": shape.category, "rejected": refusal}
+
+
+def _damaged(shapes: list[Shape], manifest: dict, folder: Path) -> list[str]:
+    """Ids of the shapes whose files are not those that were prepared; told by name."""
+    records = {shape.id: manifest["shapes"].get(shape.id) for shape in shapes}
+    records = {id: record for id, record in records.items() if record}
+    with ThreadPoolExecutor() as pool:  # hashing lets other threads run
+        found = pool.map(shards.damaged_files, [folder / id for id in records], records.values())
+    names = {id: wrong for id, wrong in zip(records, found, strict=True) if wrong}
+    for id, wrong in names.items():
+        files = ", ".join(f"{name}.npy" for name in wrong)
+        print(f"store: {folder / id}: {files} damaged (checksum): prepared again", flush=True)
+    return list(names)
+
+
+def _refuse_detours(shapes: list[Shape], folder: Path) -> None:
+    for parent in {(folder / shape.id).parent for shape in shapes}:
+        if not parent.resolve().is_relative_to(folder.resolve()):
+            raise SdfhubError(f"{parent}: leads out of the store; remove that link")
 
 
 def _missing(shapes: list[Shape], manifest: dict) -> list[Shape]:
@@ -233,43 +255,6 @@ def _missing(shapes: list[Shape], manifest: dict) -> list[Shape]:
     return [shape for shape in shapes if not is_done(shape)]
 
 
-def _enter(manifest: dict, shape: Shape, record: dict) -> None:
-    manifest["shapes"].pop(shape.id, None)
-    manifest["rejected"].pop(shape.id, None)
-    if record["rejected"]:
-        entry = {"fingerprint": record["fingerprint"], "category": record["category"]} | record["rejected"]
-        manifest["rejected"][shape.id] = entry
-    else:
-        manifest["shapes"][shape.id] = {key: value for key, value in record.items() if key != "rejected"}
-
-
-def _new_manifest(source: Source, preparation: Preparation) -> dict:
-    settings = dataclasses.asdict(preparation)
-    return {"version": VERSION, "source": source.name, "preparation": settings, "shapes": {}, "rejected": {}}
-
-
-def _read_manifest(folder: Path) -> dict | None:
-    """The manifest, or None where there is none that this version can read."""
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-        is_ours = manifest["version"] == VERSION and {"shapes", "rejected"} <= manifest.keys()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
-    return manifest if is_ours else None
-
-
-def _write_manifest(folder: Path, manifest: dict) -> None:
-    parts = {key: dict(sorted(manifest[key].items())) for key in ("shapes", "rejected")}
-    credited = Counter(
-        (record["credits"].get("author", ""), record["credits"].get("licence", ""))
-        for record in parts["shapes"].values()
-        if record["credits"]
-    )
-    authors = [{"author": a, "licence": b, "shapes": n} for (a, b), n in sorted(credited.items())]
-    content = json.dumps(manifest | {"credits": authors} | parts, indent=1)
-    shards.write_whole(folder / MANIFEST, content.encode())
-
-
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """Lets one process at a time fill a store; where locks do not work, renames alone keep it whole."""
@@ -278,7 +263,11 @@ def _locked(folder: Path) -> Iterator[None]:
         try:
             import fcntl
 
-            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                print(f"store: {folder}: waiting for another process that prepares it", flush=True)
+                fcntl.flock(file, fcntl.LOCK_EX)
         except (ImportError, OSError):
             pass
         yield

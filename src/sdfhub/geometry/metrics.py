@@ -11,6 +11,8 @@ from dataclasses import dataclass, fields
 
 import igl
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sdfhub.geometry.winding import closed_winding_numbers
@@ -49,6 +51,7 @@ class ShapeMetrics:
         failed: the reconstruction has no surface. Everything but `floor` and `cd_penalty` is None then.
         vertices: count in the reconstruction.
         faces: count in the reconstruction.
+        pieces: connected pieces of the reconstruction: beside the shape's own parts, crumbs that float.
     """
 
     cd: float | None
@@ -67,6 +70,7 @@ class ShapeMetrics:
     failed: bool
     vertices: int
     faces: int
+    pieces: int
 
 
 def judge(
@@ -94,6 +98,7 @@ def judge(
         "cd_penalty": chamfer(np.zeros((1, 3)), want[0]),
         "vertices": len(vertices),
         "faces": len(faces),
+        "pieces": pieces(len(vertices), faces),
     }
     if not _area(vertices, faces).sum() > 0:
         absent = {f.name: None for f in fields(ShapeMetrics) if f.name not in known}
@@ -195,6 +200,14 @@ def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> 
     inside = [closed_winding_numbers(*mesh, points) > 0 for mesh in (a, b)]
     union = np.count_nonzero(inside[0] | inside[1])
     return float(np.count_nonzero(inside[0] & inside[1]) / union) if union else None
+
+
+def pieces(vertex_count: int, faces: np.ndarray) -> int:
+    """Connected pieces of a mesh: faces that share a vertex belong together."""
+    used = np.unique(faces)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
+    return connected_components(graph, directed=False)[0] - (vertex_count - len(used))
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:

@@ -67,7 +67,7 @@ class AutoDecoder(L.LightningModule):
         epoch = self.global_step / max(self.trainer.num_training_batches, 1)
         loss, parts = self.objective(batch, self.progress, epoch)
         if not torch.isfinite(loss):
-            raise SdfhubError(self._divergence(parts))
+            self._refuse_divergence("loss", parts)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
             self._log(batch, parts, loss)
         return loss
@@ -103,10 +103,22 @@ class AutoDecoder(L.LightningModule):
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def _divergence(self, parts: dict[str, Tensor]) -> str:
-        culprits = ", ".join(name for name, part in parts.items() if not torch.isfinite(part)) or "their sum"
-        return (
-            f"loss is not finite at step {self.global_step} ({culprits}): the run diverged; "
+    def on_before_optimizer_step(self, optimizer) -> None:
+        if getattr(self.trainer.precision_plugin, "scaler", None) is None:  # a scaler skips such steps itself
+            gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
+            if not torch.isfinite(torch.nn.utils.get_total_norm(gradients.values())):
+                self._refuse_divergence("gradient", gradients)
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        weights = dict(self.named_parameters())
+        if not torch.isfinite(torch.nn.utils.get_total_norm(weights.values())):
+            self._refuse_divergence("model", weights)
+
+    def _refuse_divergence(self, what: str, parts: dict[str, Tensor]) -> None:
+        wrong = [name for name, part in parts.items() if not torch.isfinite(part).all()]
+        culprits = f"{', '.join(wrong[:3])}{' ...' * (len(wrong) > 3)}" if wrong else "its norm"
+        raise SdfhubError(
+            f"{what} is not finite at step {self.global_step} ({culprits}): the run diverged; "
             "lower optim.lr_decoder, activation.omega_0 or activation.beta, or loss.tau"
         )
 

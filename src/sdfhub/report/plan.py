@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
-from sdfhub.data.shards import write_whole
 from sdfhub.errors import SdfhubError
+from sdfhub.whole_file import write_whole
 
 PLAN, FAILURE = "sweep.json", "failed.json"
 

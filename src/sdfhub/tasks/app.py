@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import sdfhub
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.names import cell_name, run_name, sweep_name
+from sdfhub.tasks.names import cell_name, run_name, run_stamp, sweep_name
 
 
 def configuration_folder() -> Path:
@@ -27,10 +27,16 @@ def configuration_folder() -> Path:
 
 def register_resolvers() -> None:
     """Makes the names of folders and `${unique:}` known to the configs."""
-    for name in (run_name, sweep_name, cell_name):
+    for name in (run_name, run_stamp, sweep_name, cell_name):
         OmegaConf.register_new_resolver(name.__name__, name, replace=True)
+    OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
     # two runs that start in one second must not share a folder
     OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
+
+
+def _refuse_environment(name: str, *_: str) -> None:
+    # a run's settings are written down and passed on, and the environment holds keys and passwords
+    raise SdfhubError(f"${{oc.env:{name}}}: settings are not taken from the environment; write the value")
 
 
 def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
@@ -43,10 +49,13 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
         print(help_of(config_name))
         return
     failures: list[Exception] = []
+    composed = False
     verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
     register_resolvers()
 
     def guarded(config: DictConfig) -> None:
+        nonlocal composed
+        composed = True
         try:
             refuse_strangers(config, config_name)
             task(config)
@@ -64,12 +73,13 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     except BrokenPipeError:  # `--help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except (HydraException, OmegaConfBaseException, OSError) as error:
-        if verbose:
-            raise
-        failures.append(error)
     except KeyboardInterrupt:
         sys.exit(130)
+    except Exception as error:
+        told = isinstance(error, HydraException | OmegaConfBaseException | OSError)
+        if verbose or (composed and not told):  # what Hydra makes of a command line may raise anything
+            raise
+        failures.append(error)
     finally:
         os.environ["HYDRA_FULL_ERROR"] = str(int(verbose))
     for error in failures:

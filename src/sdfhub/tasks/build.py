@@ -69,7 +69,8 @@ def build(node: Mapping[str, Any], key: str, within: str = "sdfhub", **given: An
 def check(value: Any, hint: Any, key: str) -> Any:
     """`value` as the annotation `hint` wants it (an int where a float is due is one), or one clear line."""
     try:
-        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True, strict=False))
+        lenient = ConfigDict(arbitrary_types_allowed=True, strict=False, allow_inf_nan=False)
+        adapter = TypeAdapter(hint, config=lenient)
     except Exception:  # pydantic cannot judge every annotation, nor take a config for a dataclass
         adapter = TypeAdapter(hint)
     try:

@@ -14,7 +14,7 @@ from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, locked
 from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
-from sdfhub.tasks.run import write_text
+from sdfhub.whole_file import write_whole
 
 UNTOLD_GROUPS = ("callbacks", "trainer", "logger")
 """Groups that say where and how watched a cell runs."""
@@ -44,22 +44,35 @@ def run_cell(
             print(f"cell: {folder}: another process is training it", flush=True)
             return {}
         try:
-            return _trained(train, plain(config), folder)
+            # the processes of ddp in a multirun read the config, not what is decided here
+            alone = config.trainer.get("strategy") is None
+            return go_on(train, plain(config), folder, resume=alone)
         except Exception as error:
             _write_failure(folder, error)
             return {}
 
 
-def _trained(train: Callable, config: dict[str, Any], folder: Path) -> dict[str, Any]:
+def go_on(
+    train: Callable[[dict[str, Any], Path], dict[str, Any]],
+    config: dict[str, Any],
+    folder: Path,
+    resume: bool = True,
+) -> dict[str, Any]:
+    """Trains what a plain config describes into a folder, from where an earlier training into it ended.
+
+    Args:
+        train, folder: as for `run_cell`.
+        config: plain.
+        resume: whether a checkpoint in the folder is taken up.
+    """
     metrics = finished(folder, config)
     if metrics is not None:
-        print(f"cell: {folder}: finished before", flush=True)
+        print(f"run: {folder}: finished before", flush=True)
         return metrics
     (folder / FAILURE).unlink(missing_ok=True)
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    alone = config["trainer"].get("strategy") is None  # the processes of ddp read the config, not this
-    if config["ckpt_path"] is None and checkpoint.is_file() and alone:
-        print(f"cell: {folder}: goes on from {checkpoint.name}", flush=True)
+    if config["ckpt_path"] is None and checkpoint.is_file() and resume:
+        print(f"run: {folder}: goes on from {checkpoint.name}", flush=True)
         config["ckpt_path"] = str(checkpoint)
     return train(config, folder)
 
@@ -97,5 +110,5 @@ def _write_failure(folder: Path, error: Exception) -> None:
     told = one_line(error)
     reason = told if str(error) else type(error).__name__
     trace = "".join(traceback.format_exception(error))
-    write_text(folder / FAILURE, json.dumps({"reason": reason, "traceback": trace}, indent=1))
+    write_whole(folder / FAILURE, json.dumps({"reason": reason, "traceback": trace}, indent=1))
     print(f"sdfhub: error: {folder.name}: {reason}", file=sys.stderr, flush=True)

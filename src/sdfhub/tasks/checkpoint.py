@@ -1,46 +1,143 @@
 """Checkpoints of a run: when they are written, and that each is there whole or not at all."""
 
+import io
 import os
-import uuid
+import signal
+import subprocess
+import threading
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from sdfhub.errors import SdfhubError
+from sdfhub.whole_file import whole_file
+
+LAST = "last.ckpt"
+"""The newest state of a training."""
+
 
 class WholeFileIO(TorchCheckpointIO):
-    """Writes a checkpoint beside its place, syncs it and renames it.
+    """Writes a checkpoint whole or not at all; reads none that is damaged.
 
     Lightning's own writer goes through the temporary folder and copies across file systems: a kill at the
     wrong moment leaves half a file where the last good one was.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path, storage_options: Any | None = None) -> None:
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-        try:
-            with beside.open("wb") as file:
-                torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
+        content = io.BytesIO()
+        torch.save(checkpoint, content)  # to memory: on a full disk torch does not say what is wrong
+        with whole_file(Path(path), beside=".checkpoint.part") as file:
+            file.write(content.getbuffer())
+
+    def load_checkpoint(self, path, map_location: Any = "cpu", weights_only: bool | None = True) -> dict:
+        return read_checkpoint(Path(path), map_location)
+
+
+def read_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint whose records all have their checksums still. Runs no code of it.
+
+    PyTorch writes a CRC-32 of every record and does not look at it when it reads.
+
+    Raises:
+        SdfhubError: no such file, a damaged one, or no checkpoint.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        why = "there is no such checkpoint" if isinstance(error, FileNotFoundError) else error.strerror
+        raise SdfhubError(f"{path}: {why}; a run keeps checkpoints/{LAST}") from error
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as records:
+            if any(record.compress_type != zipfile.ZIP_STORED for record in records.infolist()):
+                raise ValueError("packed, which no training does")  # and may unpack to any size
+            if broken := records.testzip():
+                raise ValueError(f"{broken} has changed since it was written")
+        return torch.load(io.BytesIO(content), map_location=map_location, weights_only=True)
+    except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
+        raise SdfhubError(
+            f"{path}: not a readable checkpoint: damaged or none of ours; take another that training wrote, "
+            f"such as RUN/checkpoints/{LAST}"
+        ) from error
 
 
 class Snapshots(ModelCheckpoint):
     """Checkpoints that stay. A class of its own: Lightning tells the states of callbacks apart by class."""
 
 
-def checkpointing(
-    folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None
-) -> list[ModelCheckpoint]:
+class KeepLast(L.Callback):
+    """`last.ckpt` where a training ends: by itself, or told to by a signal, after the step in hand.
+
+    SIGTERM and SIGINT end the process with status 143 and 130, as the shell counts them; a second one ends
+    it at once. SIGUSR1 under SLURM (`sbatch --signal=USR1@120`) also has the job put back into the queue.
+
+    Args:
+        folder: of the checkpoints.
+    """
+
+    def __init__(self, folder: Path):
+        self.path = folder / LAST
+        self._told: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def setup(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        self._told = None
+        self._listen()
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._listen()  # again: Lightning has put its own handlers there meanwhile
+
+    def _listen(self) -> None:
+        listened = [signal.SIGTERM, signal.SIGINT]
+        if "SLURM_JOB_ID" in os.environ:
+            listened.append(signal.SIGUSR1)
+        if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
+            before = {number: signal.signal(number, self._tell) for number in listened}
+            self._before = self._before or before
+
+    def _tell(self, number: int, frame: Any) -> None:
+        if self._told is not None:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        self._told = number
+        print(f"{signal.Signals(number).name}: stopping after this step", flush=True)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
+        if not trainer.strategy.reduce_boolean_decision(self._told is not None, all=False):
+            return
+        trainer.save_checkpoint(self.path)
+        print(f"stopped after step {trainer.global_step}: {self.path}", flush=True)
+        number = self._told or signal.SIGTERM  # another process of the run was told
+        if number == signal.SIGUSR1:
+            subprocess.run(["scontrol", "requeue", os.environ["SLURM_JOB_ID"]], check=False)
+            number = signal.SIGTERM
+        raise SystemExit(128 + number)
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        trainer.save_checkpoint(self.path)  # the last epoch need not have been one of every_n_epochs
+
+    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        self._stop_listening()
+        if self._told is not None:
+            raise SystemExit(128 + self._told)
+
+    def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
+        self._stop_listening()
+
+    def _stop_listening(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+
+def checkpointing(folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None) -> list[L.Callback]:
     """`last.ckpt`, the newest state, and on demand snapshots `epoch_0500.ckpt` that stay.
 
-    An epoch is a whole number of passes over the shapes, so a run continued from any of them is exact.
+    A run continued from any of them is exact.
 
     Args:
         folder: where they lie.
@@ -51,9 +148,9 @@ def checkpointing(
         folder, filename="last", every_n_epochs=every_n_epochs, enable_version_counter=False
     )
     if snapshot_every_n_epochs is None:
-        return [last]
+        return [KeepLast(folder), last]
     name = "epoch_{epoch:04d}"
     snapshots = Snapshots(
         folder, name, auto_insert_metric_name=False, save_top_k=-1, every_n_epochs=snapshot_every_n_epochs
     )
-    return [last, snapshots]
+    return [KeepLast(folder), last, snapshots]

@@ -30,7 +30,7 @@ from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.opening import load
 from sdfhub.tasks.prepare import prepare_split
-from sdfhub.tasks.run import read_run
+from sdfhub.tasks.run import read_run, refuse_unwritable
 from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
 
 WORTH_A_PROCESS = 4
@@ -182,10 +182,11 @@ def distance_errors(
 def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     """Judges a finished run again, as `config` says, into `out` or a folder `evaluation` of the run."""
     run = Path(check(config["run"], str, "run"))
-    out = check(config["out"], str | None, "out")
+    out = check(config["out"], Path | None, "out") or run / "evaluation"
     evaluation = build(config["evaluate"], "evaluate")
     trained, roles_then = read_run(run)
     space = load(run)
+    refuse_unwritable(out)
     data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
     then = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
@@ -197,7 +198,6 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     prepared = prepare_split(source, roles, preparation, data)
     known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
-    out = Path(out) if out else run / "evaluation"
     return evaluate_model(space.decoder, space.codes, known, prepared.held_out, evaluation, out)
 
 

@@ -13,13 +13,13 @@ from omegaconf import DictConfig
 from torch.export import Dim
 from tqdm import tqdm
 
-from sdfhub.data.shards import write_whole
 from sdfhub.errors import SdfhubError
 from sdfhub.model.decoder import Decoder
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.mesh_file import FORMATS, write_mesh
 from sdfhub.tasks.opening import beside, load, write_space
+from sdfhub.whole_file import write_whole
 
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
 """What a space is exported as in one file, and the file's name by default."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfhub.data.shards import write_whole
 from sdfhub.geometry.mesher import Mesh
+from sdfhub.whole_file import write_whole
 
 FORMATS = ("ply", "obj", "glb")
 """What meshes can be written as."""

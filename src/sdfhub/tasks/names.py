@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -20,6 +21,15 @@ def run_name() -> str:
     return _joined(HydraConfig.get().runtime.choices)
 
 
+def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
+    """What tells a run's folder from others: under SLURM its job and settings, else `otherwise`.
+
+    A job that SLURM puts back into the queue finds its folder again and goes on.
+    """
+    job = os.environ.get("SLURM_JOB_ID")
+    return f"slurm-{job}_{_digest_of(_root_)}" if job else otherwise
+
+
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
     """Folder name of a multirun: the sweep's own name, so that the same command finds its cells again."""
     return _root_.hydra.runtime.choices.get("sweeps") or otherwise
@@ -27,12 +37,15 @@ def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
 
 def cell_name(*, _root_: DictConfig) -> str:
     """Folder name of a cell: its choices, its seed, and a digest of all its settings."""
-    settings = OmegaConf.masked_copy(_root_, [key for key in _root_ if key != "hydra"])
+    return f"{_joined(_root_.hydra.runtime.choices)}_seed-{_root_.seed}_{_digest_of(_root_)}"
+
+
+def _digest_of(root: DictConfig) -> str:
+    settings = OmegaConf.masked_copy(root, [key for key in root if key != "hydra"])
     try:
-        digest = settings_digest(OmegaConf.to_container(settings, resolve=True))
-    except Exception:  # a broken interpolation is that cell's own failure, to be told when it runs
-        digest = settings_digest({"overrides": list(_root_.hydra.overrides.task)})
-    return f"{_joined(_root_.hydra.runtime.choices)}_seed-{_root_.seed}_{digest}"
+        return settings_digest(OmegaConf.to_container(settings, resolve=True))
+    except Exception:  # a broken interpolation is that run's own failure, to be told when it starts
+        return settings_digest({"overrides": list(root.hydra.overrides.task)})
 
 
 def settings_digest(config: dict[str, Any]) -> str:

@@ -16,7 +16,6 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from sdfhub.data.shards import write_whole
 from sdfhub.errors import SdfhubError
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fitting import Fit
@@ -25,6 +24,7 @@ from sdfhub.space import Space
 from sdfhub.tasks.app import configuration_folder
 from sdfhub.tasks.build import build
 from sdfhub.tasks.run import build_decoder, plain_frames, put_weights, read_run, read_weights
+from sdfhub.whole_file import write_whole
 
 FORMAT = "sdfhub space 1"
 """What an exported file says it is; another number where its content means something else."""

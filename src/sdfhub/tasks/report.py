@@ -17,7 +17,8 @@ from sdfhub.report.rows import Group, group_cells
 from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.run import write_text
+from sdfhub.tasks.run import refuse_unwritable
+from sdfhub.whole_file import write_whole
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
@@ -36,10 +37,10 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     all_tables = [table for group in groups for table in tables(group)]
     print("\n" + markdown(all_tables))
     claims = [claims_table(group) for group in groups]
-    write_text(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims])}")
-    write_text(out / "table.tex", latex(all_tables))
-    write_text(out / "table.csv", csv_text(groups))
-    write_text(out / "report.html", page(sweep.name, cells, groups, truth_finder(groups), shapes))
+    write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims])}")
+    write_whole(out / "table.tex", latex(all_tables))
+    write_whole(out / "table.csv", csv_text(groups))
+    write_whole(out / "report.html", page(sweep.name, cells, groups, truth_finder(groups), shapes))
     print(f"report: {out / 'report.html'}", flush=True)
 
 
@@ -80,7 +81,9 @@ def report(config: dict[str, Any]) -> None:
     shapes = check(config["shapes"], int, "shapes")
     if shapes < 1:
         raise SdfhubError(f"shapes={shapes}: must be at least 1")
-    write_report(sweep, Path(out) if out else sweep / "report", shapes)
+    folder = Path(out) if out else sweep / "report"
+    refuse_unwritable(folder)
+    write_report(sweep, folder, shapes)
 
 
 def main() -> None:

@@ -8,8 +8,7 @@ metrics.json, metrics.csv, meshes/, contact_sheet.png, tensorboard/
 """
 
 import json
-import os
-import uuid
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,23 +21,24 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Frame
 from sdfhub.tasks.build import build
+from sdfhub.tasks.checkpoint import LAST, read_checkpoint
+from sdfhub.whole_file import write_whole
 
 if TYPE_CHECKING:
     from sdfhub.model.autodecoder import AutoDecoder
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file whole or not at all: beside its place, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+def refuse_unwritable(folder: Path) -> None:
+    """Makes a folder of results, before hours go into what should lie there.
+
+    Raises:
+        SdfhubError: nothing can be written there.
+    """
     try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise SdfhubError(f"{folder}: cannot be written ({(error.strerror or '').lower()})") from error
 
 
 def begin_run(
@@ -50,9 +50,9 @@ def begin_run(
     up: Literal["y", "z"],
 ) -> None:
     """Writes down what a run is made of, before it starts."""
-    write_text(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
-    write_text(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
-    write_text(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))
+    write_whole(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_whole(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
+    write_whole(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))
 
 
 def plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
@@ -126,20 +126,16 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
     """The `state_dict` of a checkpoint, on the CPU. Runs no code of it.
 
     Raises:
-        SdfhubError: no such file, or not a checkpoint of an auto-decoder.
+        SdfhubError: no such file, a damaged one, or not a checkpoint of an auto-decoder.
     """
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-        weights["codes.table"].shape  # noqa: B018 - anything else is not ours
-    except FileNotFoundError as error:
-        raise SdfhubError(
-            f"{path}: there is no such checkpoint; a run keeps checkpoints/last.ckpt"
-        ) from error
-    except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
-        raise SdfhubError(
-            f"{path}: not a readable checkpoint of an auto-decoder; give one that training wrote, "
-            "such as RUN/checkpoints/last.ckpt"
-        ) from error
+    content = read_checkpoint(path)
+    weights = content.get("state_dict") if isinstance(content, dict) else None
+    # a view may claim more numbers than its file holds
+    is_ours = isinstance(weights, dict) and all(
+        isinstance(weight, torch.Tensor) and weight.is_contiguous() for weight in weights.values()
+    )
+    if not is_ours or getattr(weights.get("codes.table"), "ndim", 0) != 2:
+        raise SdfhubError(f"{path}: not a checkpoint of an auto-decoder; a run keeps checkpoints/{LAST}")
     return weights
 
 

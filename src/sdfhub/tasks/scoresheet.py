@@ -17,7 +17,7 @@ from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.metrics import ShapeMetrics, summarize
 from sdfhub.geometry.render import render
 from sdfhub.tasks.mesh_file import write_mesh
-from sdfhub.tasks.run import write_text
+from sdfhub.whole_file import write_whole
 
 COLUMNS = {
     "cd": "CD x10^3",
@@ -59,12 +59,12 @@ def write_scores(
         rows = [row for row in judged if row.role == role]
         shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
         result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
-    write_text(out / "metrics.csv", _csv(judged))
+    write_whole(out / "metrics.csv", _csv(judged))
     for row in judged:
         vertices = row.vertices / row.shape.scale + row.shape.center
         write_mesh(vertices, row.faces, out / "meshes" / row.role / f"{row.shape.id}.ply")
     _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
-    write_text(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
+    write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print(table(judged))
     print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
     _print_places(out, trained=training is not None)
@@ -152,8 +152,8 @@ def write_distances(
         for head in heads:
             values = [row[head] for row in entry["shapes"]]
             entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}
-    write_text(out / "metrics.json", json.dumps(result, indent=1))
-    write_text(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
+    write_whole(out / "metrics.json", json.dumps(result, indent=1))
+    write_whole(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
     print("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     for line in lines:
         print("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))

@@ -12,6 +12,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
+from pydantic import PositiveInt
 from torch import Tensor
 
 from sdfhub.data.batches import Loading
@@ -21,12 +22,20 @@ from sdfhub.shapes import Frame
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.callbacks import LossBar, TrainingRecord
-from sdfhub.tasks.cells import run_cell
+from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
 from sdfhub.tasks.names import flat
 from sdfhub.tasks.prepare import prepare_data
-from sdfhub.tasks.run import begin_run, build_autodecoder, put_weights, read_run, read_weights
+from sdfhub.tasks.processes import ending_together
+from sdfhub.tasks.run import (
+    begin_run,
+    build_autodecoder,
+    put_weights,
+    read_run,
+    read_weights,
+    refuse_unwritable,
+)
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
 FREE_TO_CHANGE += ("computing.", "data.workers", "data.loader.workers", "data.loader.resident")
@@ -57,6 +66,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     parts = build_parts(config, run)
     if parts.loading.surface_per_shape:
         refuse_missing_normals(config["data"])
+    refuse_unwritable(run)
     prepared = prepare_data(config["data"])
     loader = SdfDataModule(prepared.train, parts.loading)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
@@ -72,9 +82,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     )
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
-    trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    with ending_together(trainer):
+        trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
     if not trainer.is_global_zero:
         return {}
     training = parts.record.summary(model)
@@ -108,7 +117,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     config["seed"] = check(config["seed"], int, "seed")
     resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
     every = {
-        key: check(value, int | None, f"checkpoint.{key}") for key, value in config["checkpoint"].items()
+        key: check(value, PositiveInt | None, f"checkpoint.{key}")
+        for key, value in config["checkpoint"].items()
     }
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
     weights = read_weights(resume_from) if resume_from else None
@@ -119,7 +129,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     training_steps(config["trainer"], 1)
     record = TrainingRecord()
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
-    watched = config["trainer"].get("enable_progress_bar", True) and sys.stdout.isatty()
+    bar = check(config["trainer"].get("enable_progress_bar", True), bool, "trainer.enable_progress_bar")
+    watched = bar and sys.stdout.isatty()
     if watched:  # in a file a bar is ten thousand lines
         callbacks.append(LossBar())
     return Parts(
@@ -193,6 +204,8 @@ def main() -> None:
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
     # a continued run has a folder of its own
     warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
+    # our loader starts from the step that a checkpoint ends with, in the middle of an epoch too
+    warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> None:
@@ -202,6 +215,6 @@ def main() -> None:
         elif name := hydra.runtime.choices.get("sweeps"):
             raise SdfhubError(f"sweeps={name}: is a table of runs; add -m")
         else:
-            train(plain(config), Path(hydra.runtime.output_dir))
+            go_on(train, plain(config), Path(hydra.runtime.output_dir))
 
     run_task(task, "config")

@@ -1,5 +1,6 @@
 """Samples that DeepSDF's own preprocessing wrote: no meshes needed."""
 
+import io
 import math
 import zipfile
 from collections.abc import Mapping
@@ -22,6 +23,9 @@ from sdfhub.shapes import ShapeSamples
 
 MAX_BYTES = 1 << 30
 """Of one array; DeepSDF's have some 8 MB."""
+
+HEADER = 1 << 16
+"""Bytes in which an array's header must lie; numpy writes 128."""
 
 _SAMPLES, _PARAMETERS = "SdfSamples", "NormalizationParameters"
 
@@ -66,7 +70,7 @@ class DeepSdfSource(Source):
         files = [file for file in files if not is_by_synset or file.parent.name in self.category_of]
         self._files = unique_ids({file: self._id(file) for file in files})
         found = [
-            (Shape(id, id.partition("/")[0], state_of(file)), self._path(file))
+            (Shape(id, id.partition("/")[0], _fingerprint(file)), self._path(file))
             for id, file in sorted(self._files.items())
         ]
         return with_roles(found, self.train_split, self.test_split)
@@ -137,9 +141,8 @@ def frame_of(path: Path) -> tuple[np.ndarray, float] | None:
     Raises:
         RejectedMesh: corrupt_file.
     """
-    parts = [_PARAMETERS if part == _SAMPLES else part for part in path.parts]
-    beside = Path(*parts)
-    if _SAMPLES not in path.parts or not beside.is_file():
+    beside = _frame_file(path)
+    if beside is None:
         return None
     offset, scale = _array(beside, "offset").ravel(), _array(beside, "scale").ravel()
     is_finite = bool(np.isfinite([*offset, *scale]).all())
@@ -148,19 +151,36 @@ def frame_of(path: Path) -> tuple[np.ndarray, float] | None:
     return -offset.astype(np.float64), float(scale[0])
 
 
+def _frame_file(path: Path) -> Path | None:
+    beside = Path(*(_PARAMETERS if part == _SAMPLES else part for part in path.parts))
+    return beside if _SAMPLES in path.parts and beside.is_file() else None
+
+
+def _fingerprint(path: Path) -> str:
+    beside = _frame_file(path)
+    return " ".join(state_of(file) for file in (path, beside) if file)
+
+
 def _array(path: Path, name: str) -> np.ndarray:
     """One floating-point array of an .npz, its size checked before anything is allocated."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
-            version = np.lib.format.read_magic(file)
+            head = io.BytesIO(file.read(HEADER))  # a header may claim gigabytes for itself
+            version = np.lib.format.read_magic(head)
             read_header = {(1, 0): np.lib.format.read_array_header_1_0}.get(
                 version, np.lib.format.read_array_header_2_0
             )
-            shape, is_fortran, dtype = read_header(file)
+            shape, is_fortran, dtype = read_header(head)
             size = math.prod(shape) * dtype.itemsize
-            if dtype.kind != "f" or size > MAX_BYTES:
+            if dtype.kind != "f" or min(shape, default=0) < 0 or size > MAX_BYTES:
                 raise ValueError(f"{name} is {list(shape)} {dtype}, not some floating-point numbers")
-            content = file.read(size)
-            return np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
-    except (OSError, KeyError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile) as error:
+            content = head.read() + file.read(size)  # to its end, where the archive's checksum is compared
+            if file.read(1):
+                raise ValueError(f"{name} is longer than its header says")
+            return np.frombuffer(content, dtype, math.prod(shape)).reshape(
+                shape, order="F" if is_fortran else "C"
+            )
+    except (MemoryError, RecursionError):
+        raise
+    except Exception as error:  # zip archives and numpy's headers break in many ways
         raise RejectedMesh("corrupt_file", f"{path}: {error}") from error

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 from sdfhub.data.mesh import FORMATS, buffer_path, read_mesh
-from sdfhub.data.shards import file_sha256
 from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, name_of_root, unique_ids
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError
+from sdfhub.whole_file import file_sha256
 
 
 class FolderSource(Source):

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from sdfhub.data.mesh import MAX_BYTES, triangles_of
-from sdfhub.data.shards import write_whole
 from sdfhub.data.sources.furniture import furniture_in, read_model
 from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, plain_categories
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.whole_file import write_whole
 
 MEASURES = ".measured.json"
 """Cache below the root: faces, extents, area and hash of the models seen so far, by file size and date."""

@@ -1,0 +1,49 @@
+"""Files that are there whole or not at all, however their writer ends, and their checksums."""
+
+import hashlib
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextmanager
+def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
+    """A file to write that appears at `path` when all of it is on the disk: a reader sees the old or the new.
+
+    Args:
+        path: its folder is made where it is missing.
+        beside: name under which it is written first; None takes a new one. A fixed name keeps what killed
+            writers leave from piling up; only one process may then write at a time.
+
+    Raises:
+        OSError: the disk is full or the folder cannot be written; names `path`, which stays as it was.
+    """
+    part = path.with_name(beside or f".{path.name}.{uuid.uuid4().hex[:12]}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        if error.errno:  # a write that fails does not say where
+            error.filename = str(path)
+        raise
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Writes a file, text as UTF-8, whole or not at all; see `whole_file`."""
+    with whole_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def file_sha256(path: Path) -> str:
+    """Hex sha256 of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,113 @@
+"""Every setting refuses what it cannot be, by name, and before a file is written or a shape prepared."""
+
+import copy
+import random
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from lightning.pytorch import Trainer
+
+from benchmarks.overrides import Started, answer, keys_and_groups, random_override, shelf, started
+from sdfhub.data import store as stores
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks import train as train_task
+from sdfhub.tasks.names import flat
+from tests.test_config import composed
+
+CONFIG = composed("data.shapes=4", "data.source.count=20")
+FREE = (
+    "activation.",
+    "category.",
+    "encoding.",
+    "data.source.categories.",
+    "normals.",
+    "output_root",
+    "scale.",
+)
+"""What other keys are filled from, or another source reads."""
+CLASSES = ("_target_", "_partial_")
+
+
+def start(config: dict, folder: Path) -> None:
+    """The start of a training, without its shapes and its steps."""
+    with patch.object(stores, "prepare", shelf), patch.object(Trainer, "fit", started):
+        train_task.train(config, folder)
+
+
+def with_value(key: str, value) -> dict:
+    config = node = copy.deepcopy(CONFIG)
+    *path, last = key.split(".")
+    for part in path:
+        node = node[part]
+    node[last] = value
+    return config
+
+
+KEYS = [
+    key for key in flat(CONFIG) if not key.startswith(FREE) and not key.endswith(("_target_", "_partial_"))
+]
+NUMBERS = [key for key in KEYS if isinstance(flat(CONFIG)[key], float)]
+COUNTS = [
+    key
+    for key in KEYS
+    if type(flat(CONFIG)[key]) is int and not key.endswith(("seed", "max_epochs")) and "trainer" not in key
+]
+
+
+def test_the_config_as_it_is_starts(tmp_path):
+    with pytest.raises(Started):
+        start(copy.deepcopy(CONFIG), tmp_path)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_setting_of_the_wrong_type_is_named(key, tmp_path):
+    with pytest.raises(SdfhubError, match=key.rpartition(".")[2]) as caught:
+        start(with_value(key, {"wrong": 1}), tmp_path)
+    assert "\n" not in str(caught.value) and not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize("key", NUMBERS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_number_that_is_none_is_named(key, value, tmp_path):
+    with pytest.raises(SdfhubError, match=key.rpartition(".")[2]):
+        start(with_value(key, value), tmp_path)
+
+
+@pytest.mark.parametrize("key", COUNTS)
+def test_a_negative_count_is_named(key, tmp_path):
+    with pytest.raises(SdfhubError, match=key.rpartition(".")[2]):
+        start(with_value(key, -3), tmp_path)
+
+
+def test_a_misspelt_command_leaves_no_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0"])
+    with pytest.raises(SystemExit):
+        train_task.main()
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_the_environment_is_not_read_into_settings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SECRET", "hunter2")
+    for key in ("data.store", "output_root", "activation.beta"):
+        verdict, told = answer([f"{key}='${{oc.env:SECRET}}'"], tmp_path)
+        assert verdict == "refused" and "not taken from the environment" in told and "hunter2" not in told
+    assert not any(b"hunter2" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+
+
+def check_random(count: int, seed: int, folder: Path) -> None:
+    keys, groups = keys_and_groups()
+    chance = random.Random(seed)
+    for number in range(count):
+        words = random_override(chance, keys, groups)
+        verdict, told = answer(words, folder / str(number))
+        assert verdict in ("started", "refused"), f"{words}: {told}"
+
+
+@pytest.mark.slow
+def test_a_thousand_random_overrides_end_without_a_traceback(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    check_random(1000, 0, tmp_path)

@@ -1,0 +1,47 @@
+"""Folders of runs: one each, found again under SLURM, and told at once where nothing can be written."""
+
+from unittest.mock import patch
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks import evaluate as evaluate_task
+from sdfhub.tasks.app import configuration_folder, register_resolvers
+from sdfhub.tasks.evaluate import evaluate_run
+from tests.test_config import composed
+
+
+def run_folder(*words: str) -> str:
+    register_resolvers()
+    with initialize_config_dir(str(configuration_folder()), version_base="1.3"):
+        config = compose("config", list(words), return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        return str(config.hydra.run.dir)
+
+
+def test_two_runs_of_one_second_have_two_folders(monkeypatch):
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    assert len({run_folder() for _ in range(5)}) == 5
+
+
+def test_a_slurm_job_has_the_same_folder_whenever_it_starts_and_one_for_each_of_its_runs(monkeypatch):
+    monkeypatch.setenv("SLURM_JOB_ID", "4711")
+    assert run_folder() == run_folder() and "/slurm-4711_" in run_folder()
+    assert run_folder("seed=1") != run_folder("seed=2")
+    monkeypatch.setenv("SLURM_JOB_ID", "4712")
+    assert "/slurm-4712_" in run_folder()
+
+
+def test_results_that_could_not_be_written_are_told_before_the_evaluation(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    config = composed(f"run={tmp_path}", f"out={tmp_path / 'file' / 'out'}", config_name="evaluate")
+    trained = composed()
+    with (
+        patch.object(evaluate_task, "read_run", lambda run: (trained, {"train": [], "held_out": []})),
+        patch.object(evaluate_task, "load_autodecoder", lambda *_: None),
+        patch.object(evaluate_task, "prepare_split", lambda *_: pytest.fail("prepared")),
+        pytest.raises(SdfhubError, match="out: cannot be written"),
+    ):
+        evaluate_run(config)
