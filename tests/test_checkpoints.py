@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing, read_checkpoint
+from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
+from sdfhub.tasks.checkpoint_file import read_checkpoint
 from sdfhub.tasks.run import build_autodecoder, read_weights
 from tests.test_config import composed
 from tests.test_training import batches

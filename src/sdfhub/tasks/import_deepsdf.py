@@ -25,7 +25,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
 from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.checkpoint import WholeFileIO
+from sdfhub.tasks.checkpoint_file import LAST, write_checkpoint
 from sdfhub.tasks.opening import load, trained_decoder
 from sdfhub.tasks.run import begin_run
 
@@ -84,7 +84,7 @@ def import_deepsdf(config: dict[str, Any]) -> Path:
     begin_run(run, config, ids, [], frames, DeepSdfSource.up)
     shutil.copyfile(folder / "specs.json", run / "specs.json")
     state = {f"decoder.{name}": weight for name, weight in weights.items()} | {"codes.table": codes}
-    WholeFileIO().save_checkpoint({"state_dict": state}, run / "checkpoints" / "last.ckpt")
+    write_checkpoint({"state_dict": state}, run / "checkpoints" / LAST)
     print(f"run: {run}: {len(load(run).ids)} shapes, {len(frames)} of them with their source's frame")
     return run
 

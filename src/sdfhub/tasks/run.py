@@ -21,7 +21,7 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Frame
 from sdfhub.tasks.build import build
-from sdfhub.tasks.checkpoint import LAST, read_checkpoint
+from sdfhub.tasks.checkpoint_file import LAST, read_checkpoint
 from sdfhub.whole_file import write_whole
 
 if TYPE_CHECKING:
