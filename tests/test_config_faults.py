@@ -81,6 +81,20 @@ def test_a_negative_count_is_named(key, tmp_path):
         start(with_value(key, -3), tmp_path)
 
 
+@pytest.mark.parametrize("key", COUNTS)
+def test_a_count_with_a_point_is_the_same_count(key, tmp_path):
+    with pytest.raises(Started):
+        start(with_value(key, float(flat(CONFIG)[key])), tmp_path)
+
+
+@pytest.mark.parametrize("value", ["abc", None, 1.5])
+def test_a_limit_of_steps_that_is_none_is_named(value, tmp_path):
+    config = copy.deepcopy(CONFIG)
+    config["trainer"]["max_steps"] = value
+    with pytest.raises(SdfhubError, match=r"trainer\.max_steps"):
+        start(config, tmp_path)
+
+
 def test_a_misspelt_command_leaves_no_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0"])

@@ -47,20 +47,13 @@ class KeepLast(L.Callback):
         self._told: int | None = None
         self._before: dict[int, Any] = {}
 
-    def setup(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
-        self._told = None
-        self._listen()
-
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        self._listen()  # again: Lightning has put its own handlers there meanwhile
-
-    def _listen(self) -> None:
+        self._told = None
         listened = [signal.SIGTERM, signal.SIGINT]
         if "SLURM_JOB_ID" in os.environ:
             listened.append(signal.SIGUSR1)
         if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
-            before = {number: signal.signal(number, self._tell) for number in listened}
-            self._before = self._before or before
+            self._before = {number: signal.signal(number, self._tell) for number in listened}
 
     def _tell(self, number: int, frame: Any) -> None:
         if self._told is not None:
@@ -81,10 +74,8 @@ class KeepLast(L.Callback):
         raise SystemExit(128 + number)
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        trainer.save_checkpoint(self.path)  # the last epoch need not have been one of every_n_epochs
-
-    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
         self._stop_listening()
+        trainer.save_checkpoint(self.path)  # the last epoch need not have been one of every_n_epochs
         if self._told is not None:
             raise SystemExit(128 + self._told)
 

@@ -101,9 +101,10 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> "Aut
     from sdfhub.model.autodecoder import AutoDecoder  # here: a space is opened without Lightning
 
     torch.manual_seed(config["seed"])
+    decoder = build_decoder(config["decoder"])
     return AutoDecoder(
-        decoder=build_decoder(config["decoder"]),
-        codes=_codes(config, rows),
+        decoder=decoder,
+        codes=_codes(config, rows, decoder.code_size),
         loss=build(config["loss"], "loss", within="sdfhub.model"),
         optim=build(config["optim"], "optim", within="sdfhub.model"),
         steps=steps,
@@ -114,10 +115,10 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> "Aut
     )
 
 
-def _codes(config: dict[str, Any], rows: int) -> CodeTable:
+def _codes(config: dict[str, Any], rows: int, size: int) -> CodeTable:
     make = build(config["codes"], "codes", within="sdfhub.model")
     try:
-        return make(shapes=rows, size=config["decoder"]["code_size"])
+        return make(shapes=rows, size=size)
     except ValueError as error:
         raise SdfhubError(f"codes: {error}") from error
 

@@ -102,10 +102,11 @@ def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
     Raises:
         SdfhubError: `max_epochs` is no positive number; schedules need an end.
     """
-    if check(trainer["max_epochs"], int | None, "trainer.max_epochs") is None or trainer["max_epochs"] < 1:
-        raise SdfhubError(f"trainer.max_epochs={trainer['max_epochs']}: must be at least 1")
-    epochs = trainer["max_epochs"] * steps_per_epoch
-    return epochs if trainer.get("max_steps", -1) < 0 else min(epochs, trainer["max_steps"])
+    epochs = check(trainer["max_epochs"], int | None, "trainer.max_epochs")
+    if epochs is None or epochs < 1:
+        raise SdfhubError(f"trainer.max_epochs={epochs}: must be at least 1")
+    limit = check(trainer.get("max_steps", -1), int, "trainer.max_steps")
+    return epochs * steps_per_epoch if limit < 0 else min(epochs * steps_per_epoch, limit)
 
 
 def build_parts(config: dict[str, Any], run: Path) -> Parts:
