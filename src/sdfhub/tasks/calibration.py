@@ -60,7 +60,7 @@ class Alike:
 
     Args:
         kind: samples, oriented, bare or view.
-        count: points, a power of four; 0 where their number does not matter.
+        count: points, a power of two; 0 where their number does not matter.
         noise: one of NOISES.
     """
 
@@ -74,8 +74,8 @@ class Alike:
         if target.kind == "samples":
             return cls("samples", 0, 0.0)
         noise = min(NOISES, key=lambda level: abs(level - target.observation.noise))
-        power = np.clip(round(np.log(target.count) / np.log(4)), 3, 8)
-        return cls(target.kind, 0 if target.kind == "view" else int(4**power), noise)
+        power = np.clip(round(np.log2(target.count)), 6, 16)
+        return cls(target.kind, 0 if target.kind == "view" else int(2**power), noise)
 
     def __str__(self) -> str:
         count = f", {self.count} points" if self.count else ""
