@@ -4,9 +4,9 @@
         [--reference 2] [--sheet sheet.png] [overrides of conf/reconstruct.yaml]
 
 Shapes: of the space's source, neither trained on nor calibrated with. Kinds: signed samples; 8192 points with
-normals; the same bare; the same with noise of 0.5% of the size (0.01 in the normalised frame, where shapes are
+normals; the same bare; the same with noise of 0.5% of the size (0.01: in the normalised frame, shapes are
 some 2 long); one view of 100 x 100 rays, from a known place. All in the normalised frame. Strangers: lamps,
-scanned alike; a right verdict is `fitted` for the space's own kind, `doubtful` for them. CD: meshes at 128^3,
+scanned alike; the right verdict is `fitted` on the space's own kind, `doubtful` on them. CD: meshes at 128^3,
 30,000 points a side, excess over the noise floor, times 10^3; ratio: of medians, to signed samples. Seconds:
 of the processor, one thread, fitting alone. With --reference also DeepSDF's recipe on the first shapes, from
 signed samples and from the oriented cloud (whose tight bounds are its samples). Of views also the distance of
@@ -130,9 +130,7 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
     first = config["calibration"]["shapes"]
     shapes = unseen_shapes(trained, roles, config["data"], first + arguments.shapes)[first:]
     strangers = prepared_lamps(arguments.strangers, trained)
-    head = (
-        "| scan | excess median | mean | ratio | no surface | own fitted | strangers doubtful | s |"
-    )
+    head = "| scan | excess median | mean | ratio | no surface | own fitted | strangers doubtful | s |"
     print(f"{head}\n{'| --- ' * 8}|", flush=True)
     base, sheet = arguments.base or np.nan, {"truth": [render_of(truth_of(each)) for each in shapes]}
     for name in arguments.kinds:

@@ -18,7 +18,7 @@ from tests.test_config import composed
 from tests.test_reconstruction import ball
 from tests.test_training import batches
 
-SPACE = ["scale=demo", "decoder.width=32", "decoder.depth=2", "decoder.code_size=4", "activation=siren"]
+SPACE = ["scale=demo", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
 SPACE += ["encoding=none", "data.preparation.samples=4000", "data.preparation.surface_points=2000"]
 QUICK = ["evidence.rows=1200", "evidence.cells=24", "method.thinning=2", "method.probes=64", "resolution=24"]
 

@@ -148,6 +148,7 @@ class Observation:
         high: [N] float32, largest; high >= low.
         unsigned: [N] bool, whether low and high bound the absolute value.
         noise: standard deviation of the surface points, same frame, >= 0.
+        partial: whether a part of the shape's surface was not seen.
     """
 
     points: np.ndarray
@@ -155,6 +156,7 @@ class Observation:
     high: np.ndarray
     unsigned: np.ndarray
     noise: float = 0.0
+    partial: bool = False
 
     def __post_init__(self):
         n = len(self.points)

@@ -1,6 +1,6 @@
 """From what was scanned to bounds of signed distances: one observation, whatever the scan was."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -129,7 +129,8 @@ class Evidence:
         low = np.concatenate([steps - slack, clear[some]])
         high = np.concatenate([np.maximum(steps, 0) + noise, tree.query(empty[some])[0] + spacing])
         none = np.zeros(len(at), bool)
-        return self._with_surface(points, (at, np.minimum(low, high), high, none), noise, rng)
+        whole = self._with_surface(points, (at, np.minimum(low, high), high, none), noise, rng)
+        return replace(whole, partial=True)
 
     def _beside(self, points, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
         """Places [Q, 3] a step before and behind seen faces, and the signed steps [Q]; flat faces only."""

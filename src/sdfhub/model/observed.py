@@ -24,9 +24,10 @@ from sdfhub.shapes import Observation
 
 
 class Rows(NamedTuple):
-    """Bounded points of B shapes: points [B, N, 3], low, high and unsigned [B, N], soft [B].
+    """Bounded points of B shapes: points [B, N, 3], low, high and unsigned [B, N], soft and weight [B].
 
-    `soft` is the violation below which the objective is a parabola, normalised frame, > 0.
+    `soft` is the violation below which the objective is a parabola, normalised frame, > 0; `weight` that of
+    the prior.
     """
 
     points: Tensor
@@ -34,28 +35,33 @@ class Rows(NamedTuple):
     high: Tensor
     unsigned: Tensor
     soft: Tensor
+    weight: Tensor
 
     def of(self, shapes: Tensor | slice, every: int = 1) -> "Rows":
         """Every so many-th row of some shapes."""
-        return Rows(*(part[shapes][:, ::every] for part in self[:4]), self.soft[shapes])
+        return Rows(*(part[shapes][:, ::every] for part in self[:4]), self.soft[shapes], self.weight[shapes])
 
     def turned(self, rotations: Tensor) -> "Rows":
         """The same with points under rotations, [3, 3] or [B, 3, 3]."""
         return self._replace(points=self.points @ rotations.mT)
 
 
-def rows_of(observations: Sequence[Observation], smallest: float, device: torch.device) -> Rows:
+def rows_of(
+    observations: Sequence[Observation], smallest: float, weights: tuple[float, float], device: torch.device
+) -> Rows:
     """Observations of equally many points as tensors.
 
     Args:
         observations: B of them.
         smallest: least of `soft`, which otherwise is an observation's noise.
+        weights: of the prior for wholly and for partly seen shapes.
         device: where to.
     """
     names = ("points", "low", "high", "unsigned")
     parts = [torch.from_numpy(np.stack([getattr(each, name) for each in observations])) for name in names]
     soft = torch.tensor([max(smallest, each.noise) for each in observations])
-    return Rows(*(part.to(device) for part in (*parts, soft)))
+    weight = torch.tensor([weights[each.partial] for each in observations])
+    return Rows(*(part.to(device) for part in (*parts, soft, weight)))
 
 
 def violation(decoder: Decoder, codes: Tensor, rows: Rows, delta: float) -> Tensor:
@@ -80,12 +86,11 @@ class Problem:
     Args:
         decoder: in evaluation mode.
         prior: of the codes.
-        weight: of the prior.
         delta: clamp of distances.
         poses: None where frames are known.
     """
 
-    def __init__(self, decoder: Decoder, prior: Normal, weight: float, delta: float, poses: PoseRange | None):
+    def __init__(self, decoder: Decoder, prior: Normal, delta: float, poses: PoseRange | None):
         self.decoder, self.prior, self.delta, self.has_pose = decoder, prior, delta, poses is not None
         self.size = len(prior.mean)
         self.center = self.unknowns(prior.mean)
@@ -94,7 +99,7 @@ class Problem:
         if poses:
             self.turns = turns(poses.turns, poses.up).to(prior.mean)
             precision = torch.block_diag(precision, poses.spread().to(precision).pow(-2).diag())
-        self.precision = precision * (weight / self.size)
+        self.precision = precision / self.size
 
     def unknowns(self, codes: Tensor) -> Tensor:
         """Unknowns [..., U] of codes [..., L] in the frame as it is."""
@@ -115,11 +120,11 @@ class Problem:
         huber = torch.where(size < soft, size.square() / (2 * soft), size - soft / 2)
         weighted = (jacobian / torch.maximum(size, soft)[..., None] / found.shape[1]).mT
         away = unknowns - self.center
-        pull = away @ self.precision
+        pull = away @ self.precision * rows.weight[:, None]
         return Quadratic(
             value=huber.mean(1) + (pull * away).sum(1),
             gradient=(weighted @ found[..., None]).squeeze(-1) + 2 * pull,
-            hessian=weighted @ jacobian + 2 * self.precision,
+            hessian=weighted @ jacobian + 2 * self.precision * rows.weight[:, None, None],
         )
 
     def violation_and_jacobian(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,7 +133,8 @@ class Problem:
         Each row carries a copy of its shape's unknowns, so that one backward pass gives every row.
         """
         shapes, count = rows.low.shape
-        each = Rows(*(part.flatten(0, 1)[:, None] for part in rows.turned(self.turns[turn])[:4]), rows.soft)
+        turned = rows.turned(self.turns[turn])
+        each = Rows(*(part.flatten(0, 1)[:, None] for part in turned[:4]), rows.soft, rows.weight)
         with torch.enable_grad():
             copies = unknowns.repeat_interleave(count, 0).requires_grad_()
             if self.has_pose:

@@ -67,6 +67,7 @@ class MapFit:
     Args:
         prior: of the codes.
         weight: of the prior, >= 0.
+        weight_partial: the same for shapes of which only a part was seen, >= 0.
         random: draws from the prior to start from, >= 0.
         nearest: training codes to start from, by their violation on `probes` rows, >= 0.
         probes: rows that training codes, and turns of an unknown pose, are compared on, >= 1.
@@ -83,6 +84,7 @@ class MapFit:
 
     prior: Prior
     weight: float
+    weight_partial: float
     random: int
     nearest: int
     probes: int
@@ -99,8 +101,8 @@ class MapFit:
     def __post_init__(self):
         if min(self.probes, self.refined, self.thinning, self.steps) < 1:
             raise ValueError("probes, refined, thinning and steps must be at least 1")
-        if min(self.random, self.nearest, self.weight) < 0:
-            raise ValueError("random, nearest and weight must not be negative")
+        if min(self.random, self.nearest, self.weight, self.weight_partial) < 0:
+            raise ValueError("random, nearest and weights must not be negative")
         if min(self.smallest, self.blurred, self.delta, self.damping) <= 0:
             raise ValueError("smallest, blurred, delta and damping must be positive")
 
@@ -114,8 +116,9 @@ class MapFit:
     ) -> Fitted:
         """As `Method` says."""
         with frozen(decoder):
-            problem = Problem(decoder, self.prior(codes), self.weight, self.delta, poses)
-            rows = rows_of(observations, self.smallest, codes.device)
+            problem = Problem(decoder, self.prior(codes), self.delta, poses)
+            weights = self.weight, self.weight_partial
+            rows = rows_of(observations, self.smallest, weights, codes.device)
             # a CPU is as fast with one shape at a time, and then no neighbour changes even a rounding
             together = 1 if codes.device.type == "cpu" else len(observations)
             groups = [slice(first, first + together) for first in range(0, len(observations), together)]
@@ -258,5 +261,5 @@ class DeepSdfFit:
 
         code = self.adam(decoder, draw, [self.seed])
         with frozen(decoder), torch.no_grad():
-            rows = rows_of([observation], self.adam.delta, device)
+            rows = rows_of([observation], self.adam.delta, (0.0, 0.0), device)
             return Fitted(code, violation(decoder, code, rows, self.adam.delta).abs().mean(1))
