@@ -160,3 +160,9 @@ def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch,
         task.main()
     message = capsys.readouterr().err.strip()
     assert stop.value.code == 2 and "not of this version" in message and len(message.splitlines()) == 1
+
+
+def test_results_never_overwrite_a_scan(run, tmp_path):
+    trimesh.creation.icosphere().export(tmp_path / "ball.ply")
+    with pytest.raises(task.SdfhubError, match="overwrite"):
+        reconstructed(run, f"target={tmp_path}", f"out={tmp_path}")

@@ -64,7 +64,7 @@ def test_bounds_of_a_view_hold_the_truth_behind_it(box):
     points = view_scan(box, SENSOR, 60, 0.0, rng)
     assert np.abs(true_sdf(box, points)).max() < 1e-5
     assert points[:, 1].max() < box.vertices[:, 1].max() - 0.05, "the far side is not seen"
-    seen = Evidence(**EVIDENCE).of_view(points, SENSOR, rng)
+    seen = Evidence(**EVIDENCE).of_view(points, None, SENSOR, rng)
     assert np.mean(excluded(box, seen) > 0.005) < 0.02
     assert (seen.low > 0.05).mean() > 0.02, "free space keeps surfaces away"
 

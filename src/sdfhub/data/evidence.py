@@ -71,11 +71,7 @@ class Evidence:
         return self._shuffled((points[rows], sdf[rows], sdf[rows], signed), 0.0, rng)
 
     def of_cloud(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray | None,
-        rng: np.random.Generator,
-        noise: float | None = None,
+        self, points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
     ) -> Observation:
         """From points [M, 3] all over a closed surface, normalised frame, with normals [M, 3] or without.
 
@@ -83,7 +79,7 @@ class Evidence:
         there or what the gaps between points leave. With normals the winding number tells its sign; without
         them it is known only where one comes from outside without meeting the cloud.
         """
-        noise = self.noise_in(points) if noise is None else noise
+        noise = self._noise_in(points)
         tree, spacing = cKDTree(points), spacing_of(points)
         at = np.concatenate([self._near(points, rng), rng.uniform(-1, 1, (self._uniform(), 3))])
         distances, nearest = tree.query(at, PLANES)
@@ -111,17 +107,21 @@ class Evidence:
         return turns < 0.5 - self.certain, turns > 0.5 + self.certain
 
     def of_view(
-        self, points: np.ndarray, sensor: np.ndarray, rng: np.random.Generator, noise: float | None = None
+        self,
+        points: np.ndarray,
+        normals: np.ndarray | None,
+        sensor: np.ndarray,
+        rng: np.random.Generator,
     ) -> Observation:
-        """From points [M, 3] that one sensor at `sensor` [3] saw, normalised frame.
+        """From points [M, 3] that one sensor at `sensor` [3] saw, with normals [M, 3] or without.
 
         Free space is at least as far from any surface as from space not known to be free, and nothing is
         further from the surface than from the nearest seen point. Beside the seen points, the side of the
         sensor is outside.
         """
-        noise = self.noise_in(points) if noise is None else noise
+        noise = self._noise_in(points)
         tree, spacing = cKDTree(points), spacing_of(points)
-        beside, steps = self._beside(points, sensor, max(2 * spacing, 3 * noise), tree, rng)
+        beside, steps = self._beside(points, normals, sensor, max(2 * spacing, 3 * noise), tree, rng)
         slack = np.where(steps > 0, noise, np.abs(steps))  # the part may be thin behind its face
         empty, clear = free_space(points, sensor, self.cells, self.background)
         some = rng.integers(len(empty), size=self._uniform()) if len(empty) else np.zeros(0, np.int64)
@@ -132,11 +132,17 @@ class Evidence:
         whole = self._with_surface(points, (at, np.minimum(low, high), high, none), noise, rng)
         return replace(whole, partial=True)
 
-    def _beside(self, points, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
-        """Places [Q, 3] a step before and behind seen faces, and the signed steps [Q]; flat faces only."""
-        normals, scatter = tangent_planes(points)
-        normals[np.einsum("ij,ij->i", normals, points - sensor) > 0] *= -1
-        flat = np.flatnonzero(scatter <= np.median(scatter))
+    def _beside(self, points, normals, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
+        """Places [Q, 3] a step before and behind seen points, and the signed steps [Q].
+
+        Where normals are not given, only the flatter half of the surface has such that can be trusted.
+        """
+        flat = np.arange(len(points))
+        if normals is None:
+            normals, scatter = tangent_planes(points)
+            flat = np.flatnonzero(scatter <= np.median(scatter))
+        away = np.einsum("ij,ij->i", normals, points - sensor) > 0
+        normals = np.where(away[:, None], -normals, normals)
         steps = np.repeat([step, -step], len(flat))
         beside = np.tile(points[flat], (2, 1)) + steps[:, None] * np.tile(normals[flat], (2, 1))
         own = np.flatnonzero(tree.query(beside)[1] == np.tile(flat, 2))
@@ -144,7 +150,7 @@ class Evidence:
         own = rng.choice(own, count) if len(own) else own
         return beside[own], steps[own]
 
-    def noise_in(self, points: np.ndarray) -> float:
+    def _noise_in(self, points: np.ndarray) -> float:
         """The noise of points [M, 3], normalised frame, or 0 where there is hardly any."""
         found = noise_of(points)
         return found if found > self.quiet else 0.0

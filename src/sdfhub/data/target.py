@@ -15,6 +15,9 @@ from sdfhub.shapes import RADIUS, Observation
 Frame = Literal["shape", "normalised", "unknown"]
 """How a scan lies to the normalised frame: as its own bounding box tells, in it, or nobody knows."""
 
+MOST = 2**16
+"""Points of a cloud that are used: a random draw of more."""
+
 LARGEST, SMALLEST = 1.2, 0.2
 """Distance of the farthest point from the origin that a scan in the normalised frame may have."""
 
@@ -69,10 +72,22 @@ def observed(scan: Scan, evidence: Evidence, frame: Frame, rng: np.random.Genera
         observation = evidence.of_samples(points, scan.sdf, rng)
         center, scale = (scan.center, scan.scale) if scan.center is not None else (center, scale)
     elif scan.sensor is not None:
-        observation = evidence.of_view(points, (scan.sensor - center) * scale, rng)
+        points, normals = thinned(points, scan.normals, rng)
+        observation = evidence.of_view(points, normals, (scan.sensor - center) * scale, rng)
     else:
-        observation = evidence.of_cloud(points, scan.normals, rng)
+        points, normals = thinned(points, scan.normals, rng)
+        observation = evidence.of_cloud(points, normals, rng)
     return Target("samples" if scan.sdf is not None else scan.kind, len(points), observation, center, scale)
+
+
+def thinned(
+    points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """At most MOST of the points [N, 3] and of their normals."""
+    if len(points) <= MOST:
+        return points, normals
+    kept = rng.permutation(len(points))[:MOST]
+    return points[kept], None if normals is None else normals[kept]
 
 
 def box_frame(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -101,6 +101,9 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
     together = check(config["together"], Annotated[int, Ge(1)], "together")
     files = scan_files(check(config["target"], str | list[str], "target"))
+    for name, path in files.items():
+        if (out / f"{name}.ply").resolve() == path.resolve():
+            raise SdfhubError(f"out={out}: its results would overwrite {path}; choose another folder")
     trained, roles = read_run(run)
     how = reconstructor(run, trained, config)
     targets, results = read_targets(how, files, sensor)
