@@ -86,12 +86,18 @@ class Alike:
         return observed(self.scan(shape), evidence, "normalised", np.random.default_rng(shape_seed(shape)))
 
     def scan(self, shape: StoredShape) -> Scan:
-        """A simulated scan of a shape, in the normalised frame."""
+        """A simulated scan of a shape, in the normalised frame.
+
+        Raises:
+            SdfhubError: the shape has no mesh to be scanned.
+        """
         rng = np.random.default_rng(shape_seed(shape))
         if self.kind == "samples":
             rows = np.concatenate([shape.outside, shape.inside]).astype(np.float64)
             return Scan(rows[:, :3], sdf=rows[:, 3])
         mesh = shape.mesh
+        if mesh is None:
+            raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")
         if self.kind == "view":
             sensor = random_sensor(rng, shape.up)
             return Scan(view_scan(mesh, sensor, PIXELS, self.noise, rng), sensor=sensor)
@@ -145,7 +151,7 @@ def calibrated(
     """
     key, kept = _digest(run, settings), _read(run / FILE)
     known = kept.get(key, {})
-    missing = [each for each in kinds if str(each) not in known]
+    missing = [each for each in kinds if "threshold" not in known.get(str(each), {})]
     shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
     for each in missing:
         targets = [each.target(shape, fitter.evidence) for shape in shapes]
@@ -165,7 +171,8 @@ def unseen_shapes(
     offered = {shape.id: shape for shape in source.shapes()}
     first = [offered[id] for id in roles["held_out"] if id in offered][:count]
     used = {*roles["train"], *roles["held_out"]}
-    others = [shape for id, shape in offered.items() if id not in used]
+    others = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
+    others = [shape for shape in others if shape.split == "test"] or others
     more = split(others, 0, min(count - len(first), len(others)), seed=0).test
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     found = prepare_split(source, Split([], first + more), preparation, data).held_out
@@ -185,6 +192,6 @@ def _read(path: Path) -> dict[str, Any]:
     """What is kept; nothing where the file is missing or broken, which costs a calibration."""
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
-        return {key: dict(value) for key, value in kept.items()}
+        return {key: {kind: dict(entry) for kind, entry in kinds.items()} for key, kinds in kept.items()}
     except (OSError, ValueError, AttributeError, TypeError):
         return {}

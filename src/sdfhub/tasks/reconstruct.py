@@ -20,10 +20,6 @@ from sdfhub.tasks.calibration import Alike, calibrated
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
 from sdfhub.tasks.run import load_autodecoder, read_run
 
-SETTINGS = ("method", "evidence", "poses", "frame", "calibration")
-"""Keys that thresholds depend on."""
-
-
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     """The files to read, those of a folder included, by the names of their results.
 
@@ -86,7 +82,8 @@ def thresholds_of(
     calibration = build(config["calibration"], "calibration")
     if not calibration.shapes:
         return {}
-    settings = {key: config[key] for key in SETTINGS}
+    settings = {key: config[key] for key in ("method", "evidence", "calibration")}
+    settings["poses"] = config["poses"] if how.poses else None
     try:
         return calibrated(run, trained, roles, calibration, kinds, how, settings, config["data"])
     except (SdfhubError, OSError) as error:
