@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from annotated_types import Ge
 from omegaconf import DictConfig
+from pydantic import Field
 from tqdm import tqdm
 
 from sdfhub.data.scan import FORMATS
@@ -19,6 +19,7 @@ from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, calibrated
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
 from sdfhub.tasks.run import load_autodecoder, read_run
+
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     """The files to read, those of a folder included, by the names of their results.
@@ -66,7 +67,7 @@ def reconstructor(run: Path, trained: dict[str, Any], config: dict[str, Any]) ->
         evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
         frame=frame,
         poses=poses,
-        resolution=check(config["resolution"], Annotated[int, Ge(2)], "resolution"),
+        resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
     )
 
 
@@ -96,7 +97,7 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     run = Path(check(config["run"], str, "run"))
     out = Path(check(config["out"], str | None, "out") or run / "reconstructions")
     sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
-    together = check(config["together"], Annotated[int, Ge(1)], "together")
+    together = check(config["together"], Annotated[int, Field(ge=1)], "together")
     files = scan_files(check(config["target"], str | list[str], "target"))
     for name, path in files.items():
         if (out / f"{name}.ply").resolve() == path.resolve():
