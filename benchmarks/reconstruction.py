@@ -126,7 +126,7 @@ def configured(run: Path, overrides: list[str], method: str) -> dict:
 def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
     run, config = arguments.space, configured(arguments.space, overrides, "map")
     trained, roles = read_run(run)
-    how = reconstructor(run, trained, config)
+    how = reconstructor(run, config)
     first = config["calibration"]["shapes"]
     shapes = unseen_shapes(trained, roles, config["data"], first + arguments.shapes)[first:]
     strangers = prepared_lamps(arguments.strangers, trained)
@@ -135,7 +135,7 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
     base, sheet = arguments.base or np.nan, {"truth": [render_of(truth_of(each)) for each in shapes]}
     for name in arguments.kinds:
         kind = KINDS[name]
-        threshold = thresholds_of(run, trained, roles, how, [kind], config).get(kind)
+        threshold = thresholds_of(run, how, [kind], config).get(kind)
         own, seconds = fit_all(how, [kind.target(each, how.evidence) for each in shapes])
         others, _ = fit_all(how, [kind.target(each, how.evidence) for each in strangers])
         meshes, residuals, strange = [m for m, _ in own], [r for _, r in own], [r for _, r in others]
@@ -150,7 +150,7 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
             print(f"\nview, true surface to reconstruction: {view_line(shapes, kind, meshes)}\n")
         sheet[name] = list(map(render_of, meshes))
         if arguments.reference and name in ("samples", "oriented"):
-            compare_with_deepsdf(arguments, overrides, trained, kind, shapes, excess, base)
+            compare_with_deepsdf(arguments, overrides, kind, shapes, excess, base)
     if arguments.sheet:
         contact_sheet(list(sheet.values()), list(sheet), [each.id for each in shapes], arguments.sheet)
 
@@ -158,14 +158,13 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
 def compare_with_deepsdf(
     arguments: argparse.Namespace,
     overrides: list[str],
-    trained: dict,
     kind: Alike,
     shapes: list[StoredShape],
     excess: np.ndarray,
     base: float,
 ) -> None:
     count = arguments.reference
-    rival = reconstructor(arguments.space, trained, configured(arguments.space, overrides, "deepsdf"))
+    rival = reconstructor(arguments.space, configured(arguments.space, overrides, "deepsdf"))
     theirs, seconds = fit_all(rival, [kind.target(each, rival.evidence) for each in shapes[:count]])
     row(f"{kind.kind}, first {count}", excess[:count], base, np.nan)
     other = excesses(shapes[:count], [mesh for mesh, _ in theirs])

@@ -36,7 +36,9 @@ def run(tmp_path_factory):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    begin_run(folder, config, [f"chairs/000{row}" for row in range(4)], ["chairs/0007", "chairs/0009"])
+    begin_run(
+        folder, config, [f"chairs/000{row}" for row in range(4)], ["chairs/0007", "chairs/0009"], {}, "z"
+    )
     (folder / "checkpoints").mkdir()
     torch.save({"state_dict": model.state_dict()}, folder / "checkpoints" / "last.ckpt")
     return folder
@@ -152,14 +154,18 @@ def test_a_mistake_is_one_line_that_names_it(run, scans, override, monkeypatch, 
 
 def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch, capsys):
     other = tmp_path / "other"
-    begin_run(other, {"seed": 0, "model": {}}, [], [])
+    begin_run(other, {"seed": 0, "model": {}}, ["a"], [], {}, "z")
     (other / "checkpoints").mkdir()
     (other / "checkpoints" / "last.ckpt").write_bytes((run / "checkpoints" / "last.ckpt").read_bytes())
     monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"target={scans}"])
     with pytest.raises(SystemExit) as stop:
         task.main()
     message = capsys.readouterr().err.strip()
-    assert stop.value.code == 2 and "not of this version" in message and len(message.splitlines()) == 1
+    assert (
+        stop.value.code == 2
+        and "not a shape space that this version reads" in message
+        and len(message.splitlines()) == 1
+    )
 
 
 def test_results_never_overwrite_a_scan(run, tmp_path):

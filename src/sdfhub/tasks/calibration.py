@@ -15,14 +15,14 @@ import numpy as np
 from sdfhub.data.evidence import Evidence
 from sdfhub.data.scan import Scan
 from sdfhub.data.scanning import surface_scan, view_scan
-from sdfhub.data.shards import StoredShape, file_sha256
+from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import shape_seed
 from sdfhub.data.target import Target, observed
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.build import build
 from sdfhub.tasks.prepare import prepare_split
-from sdfhub.tasks.run import write_text
+from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
 NOISES = (0.0, 0.005, 0.01, 0.02)
@@ -158,7 +158,7 @@ def calibrated(
         residuals = fitter.residuals(targets)
         entry = {"threshold": calibration.threshold(residuals), "residuals": residuals.tolist()}
         known[str(each)] = entry | {"shapes": [shape.id for shape in shapes]}
-        write_text(run / FILE, json.dumps(kept | {key: known}, indent=1))
+        write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
     return {each: float(known[str(each)]["threshold"]) for each in kinds}
 
 

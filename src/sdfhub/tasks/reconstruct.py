@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 from omegaconf import DictConfig
 from pydantic import Field
 from tqdm import tqdm
@@ -17,8 +16,9 @@ from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, calibrated
+from sdfhub.tasks.opening import beside, load
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
-from sdfhub.tasks.run import load_autodecoder, read_run
+from sdfhub.tasks.run import read_run, refuse_unwritable
 
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
@@ -53,31 +53,23 @@ def read_targets(
     return targets, failed
 
 
-def reconstructor(run: Path, trained: dict[str, Any], config: dict[str, Any]) -> Reconstructor:
-    """The space of a run, and how it is to be used."""
+def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
+    """The space of a run or an exported file, and how it is to be used."""
     frame = check(config["frame"], Frame, "frame")
-    model = load_autodecoder(run, trained).to("cuda" if torch.cuda.is_available() else "cpu")
-    poses = None
-    if frame == "unknown":
-        source = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
-        poses = build(config["poses"], "poses", within="sdfhub.model", up=source.up)
+    space = load(run)
+    poses = build(config["poses"], "poses", within="sdfhub.model", up=space.up)
     return Reconstructor(
-        model,
+        space,
         method=build(config["method"], "method", within="sdfhub.model"),
         evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
         frame=frame,
-        poses=poses,
+        poses=poses if frame == "unknown" else None,
         resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
     )
 
 
 def thresholds_of(
-    run: Path,
-    trained: dict[str, Any],
-    roles: dict[str, list[str]],
-    how: Reconstructor,
-    kinds: Sequence[Alike],
-    config: dict[str, Any],
+    run: Path, how: Reconstructor, kinds: Sequence[Alike], config: dict[str, Any]
 ) -> dict[Alike, float]:
     """The thresholds of kinds of scans; none, and a line that says why, where they cannot be had."""
     calibration = build(config["calibration"], "calibration")
@@ -86,6 +78,7 @@ def thresholds_of(
     settings = {key: config[key] for key in ("method", "evidence", "calibration")}
     settings["poses"] = config["poses"] if how.poses else None
     try:
+        trained, roles = read_run(run)
         return calibrated(run, trained, roles, calibration, kinds, how, settings, config["data"])
     except (SdfhubError, OSError) as error:
         print(f"no verdicts: {error}", file=sys.stderr)
@@ -95,19 +88,19 @@ def thresholds_of(
 def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     """Finds the shapes behind what `target` names, as `config` (conf/reconstruct.yaml) says."""
     run = Path(check(config["run"], str, "run"))
-    out = Path(check(config["out"], str | None, "out") or run / "reconstructions")
+    out = beside(str(run), check(config["out"], str | None, "out"), "reconstructions")
     sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
     together = check(config["together"], Annotated[int, Field(ge=1)], "together")
     files = scan_files(check(config["target"], str | list[str], "target"))
     for name, path in files.items():
         if (out / f"{name}.ply").resolve() == path.resolve():
             raise SdfhubError(f"out={out}: its results would overwrite {path}; choose another folder")
-    trained, roles = read_run(run)
-    how = reconstructor(run, trained, config)
+    how = reconstructor(run, config)
+    refuse_unwritable(out)
     targets, results = read_targets(how, files, sensor)
     kinds = list(dict.fromkeys(map(Alike.to, targets.values())))
-    thresholds = thresholds_of(run, trained, roles, how, kinds, config) if targets else {}
-    together = 1 if how.model.device.type == "cpu" else together
+    thresholds = thresholds_of(run, how, kinds, config) if targets else {}
+    together = 1 if how.space.device.type == "cpu" else together
     found = reconstruct_targets(how, targets, thresholds, out, together)
     results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
     print(table(results))

@@ -14,13 +14,12 @@ from sdfhub.data.scan import read_scan
 from sdfhub.data.target import Frame, Target, observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
-from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.reconstruction import Fitted, Method
 from sdfhub.model.similarity import PoseRange
+from sdfhub.space import Space
 from sdfhub.tasks.calibration import Alike
-from sdfhub.tasks.evaluate import reconstruct
-from sdfhub.tasks.run import write_text
-from sdfhub.tasks.scoresheet import write_ply
+from sdfhub.tasks.mesh_file import write_mesh
+from sdfhub.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Reconstructor:
     """A trained space and how scans are fitted in it.
 
     Args:
-        model: in evaluation mode.
+        space: where codes are looked for.
         method: finds codes and poses.
         evidence: what a scan says.
         frame: of the scans.
@@ -36,7 +35,7 @@ class Reconstructor:
         resolution: points along an axis of the marching-cubes grid, >= 2.
     """
 
-    model: AutoDecoder
+    space: Space
     method: Method
     evidence: Evidence
     frame: Frame
@@ -63,9 +62,9 @@ class Reconstructor:
 
     def fit(self, targets: Sequence[Target]) -> Fitted:
         """Codes, residuals and poses of targets, each found as if it were alone."""
-        codes = self.model.codes.table.detach()
+        observations = [each.observation for each in targets]
         try:
-            return self.method(self.model.decoder, codes, [each.observation for each in targets], self.poses)
+            return self.method(self.space.decoder, self.space.codes, observations, self.poses)
         except ValueError as error:
             raise SdfhubError(f"method: {error}") from error
 
@@ -76,7 +75,7 @@ class Reconstructor:
 
     def meshes(self, targets: Sequence[Target], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
         """Meshes in the targets' own frames, and the matrices [4, 4] from the normalised frame to these."""
-        for row, mesh in enumerate(reconstruct(self.model.decoder, fitted.codes, self.resolution)):
+        for row, mesh in enumerate(self.space.meshes(fitted.codes, self.resolution)):
             matrix = to_scan(targets[row], fitted, row)
             yield (mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]), matrix
 
@@ -188,8 +187,8 @@ def _reconstruct_group(
 def _write(found: Found, mesh: Mesh, out: Path) -> None:
     """The mesh first, what is said of it last."""
     if found.mesh:
-        write_ply(*mesh, out / found.mesh)
-    write_text(out / f"{found.name}.json", json.dumps(asdict(found), indent=1))
+        write_mesh(*mesh, out / found.mesh)
+    write_whole(out / f"{found.name}.json", json.dumps(asdict(found), indent=1))
 
 
 def table(results: Sequence[Found]) -> str:
