@@ -80,7 +80,7 @@ def thresholds_of(
     try:
         trained, roles = read_run(run)
         return calibrated(run, trained, roles, calibration, kinds, how, settings, config["data"])
-    except (SdfhubError, OSError) as error:
+    except (SdfhubError, OSError, LookupError, TypeError) as error:  # whatever an older run lacks
         print(f"no verdicts: {error}", file=sys.stderr)
         return {}
 
