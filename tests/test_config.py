@@ -15,7 +15,10 @@ from sdfhub.tasks.run import build_autodecoder
 
 CONF = configuration_folder()
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
-CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+OTHER_TASKS = ("method", "prior")
+"""Groups of `sdfhub reconstruct` alone."""
+ALL_CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
+CHOICES = [(group, choice) for group, choice in ALL_CHOICES if group not in OTHER_TASKS]
 
 
 def composed(*overrides: str, config_name: str = "config"):
@@ -43,6 +46,13 @@ def test_every_choice_composes_and_builds(group, choice):
         build(config["data"]["source"], "data.source")
     except SdfhubError as error:  # a source whose root is not on this machine says so
         assert config["data"]["source"].get("root", "?") in str(error)
+
+
+@pytest.mark.parametrize(("group", "choice"), [pair for pair in ALL_CHOICES if pair[0] in OTHER_TASKS])
+def test_every_choice_of_reconstruct_composes_and_builds(group, choice):
+    config = composed("run=-", "target=-", f"{group}={choice}", config_name="reconstruct")
+    for name in ("method", "evidence", "poses", "calibration"):
+        build(config[name], name)
 
 
 def test_issue_groups_are_all_there():

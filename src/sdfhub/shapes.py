@@ -1,4 +1,4 @@
-"""What crosses the seams: a mesh, the samples of a shape, a batch. Each is checked once, here.
+"""What crosses the seams: a mesh, samples or an observation of a shape, a batch. Each is checked once, here.
 
 Frame: a shape's bounding-box centre lies at 0 and its farthest vertex at 1 / 1.03, so all of it lies
 in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
@@ -132,6 +132,42 @@ class ShapeSamples:
                 raise ValueError(f"{name}: must be finite")
         if m and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3:
             raise ValueError("surface_normals: must have unit length")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What is known of the signed distances of one shape: bounds of them at some points.
+
+    A sample of the field has equal bounds; a point on the surface has 0 and 0; a point that a ray crossed
+    has 0 or more below; any point has its distance to the observed surface above. Where no side is known,
+    the bounds are those of the unsigned distance.
+
+    Args:
+        points: [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity); in random order.
+        low: [N] float32, least signed distance there.
+        high: [N] float32, largest; high >= low.
+        unsigned: [N] bool, whether low and high bound the absolute value.
+        noise: standard deviation of the surface points, same frame, >= 0.
+        partial: whether a part of the shape's surface was not seen.
+    """
+
+    points: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    unsigned: np.ndarray
+    noise: float = 0.0
+    partial: bool = False
+
+    def __post_init__(self):
+        n = len(self.points)
+        _check("points", self.points, (n, 3), np.float32)
+        _check("low", self.low, (n,), np.float32)
+        _check("high", self.high, (n,), np.float32)
+        _check("unsigned", self.unsigned, (n,), np.bool_)
+        if not n or not all(np.isfinite(part).all() for part in (self.points, self.low, self.high)):
+            raise ValueError("points, low and high: must be finite, at least one")
+        if (self.low > self.high).any() or not 0 <= self.noise < np.inf:
+            raise ValueError("low must not lie above high, noise must be a number >= 0")
 
 
 @dataclass(frozen=True)

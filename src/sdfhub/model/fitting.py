@@ -10,12 +10,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from sdfhub.model.decoder import Decoder
+from sdfhub.model.gauss_newton import Quadratic, descend
 from sdfhub.model.losses import clamped_l1
 
 Draw = Callable[[int], tuple[Tensor, Tensor]]
@@ -92,30 +93,15 @@ class AdamFit:
         return codes.detach()
 
 
-class Quadratic(NamedTuple):
-    """The objective of B shapes about their codes.
-
-    Args:
-        value: [B].
-        gradient: [B, L].
-        hessian: [B, L, L], positive definite where lambda_code > 0.
-    """
-
-    value: Tensor
-    gradient: Tensor
-    hessian: Tensor
-
-
 @dataclass(frozen=True)
 class GaussNewtonFit:
     """Damped Gauss-Newton steps on one draw of samples, first on a few of them, then on all.
 
     A code has some hundred numbers and a shape thousands of residuals, so a step can solve for the code
     instead of following its gradient; some twenty do what Adam needs hundreds for. The absolute value enters
-    as a reweighted square: |r| ~ r^2 / |r| with the weight 1 / max(|r|, smallest) held during a step. A step
-    that does not lower the true objective is not taken, and damped more.
+    as a reweighted square: |r| ~ r^2 / |r| with the weight 1 / max(|r|, smallest) held during a step.
 
-    Source: Levenberg 1944 and Marquardt 1963 (damping); Holland and Welsch 1977 (reweighting).
+    Source: Holland and Welsch 1977 (reweighting).
 
     Args:
         steps: most steps of a pass, >= 1.
@@ -159,29 +145,12 @@ class GaussNewtonFit:
     def _fit(self, decoder, codes: Tensor, points: Tensor, sdf: Tensor) -> Tensor:
         damping = torch.full_like(codes[:, 0], self.damping)
         for every in (self.thinning, 1):
-            codes, damping = self._descend(decoder, points[:, ::every], sdf[:, ::every], codes, damping)
-        return codes
 
-    def _descend(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor, damping: Tensor):
-        """Codes [B, L] after at most `steps` steps, and the damping [B] to go on with."""
-        codes, damping = codes.clone(), damping.clone()
-        at = self._about(decoder, points, sdf, codes)
-        left = torch.arange(len(codes), device=codes.device)  # shapes that are not done
-        for _ in range(self.steps):
-            tried = codes[left] + _step(at.gradient[left], at.hessian[left], damping[left])
-            there = self._about(decoder, points[left], sdf[left], tried)
-            gain = at.value[left] - there.value
-            lower = gain > 0  # false where there is no number
-            damping[left] = torch.where(lower, damping[left] * 0.3, damping[left] * 4).clamp(1e-5, 1e6)
-            done = lower & (gain < self.tolerance * at.value[left])
-            better = left[lower]
-            codes[better] = tried[lower]
-            for old, new in zip(at, there, strict=True):
-                old[better] = new[lower]
-            left = left[~done]
-            if not len(left):
-                break
-        return codes, damping
+            def about(shapes: Tensor, at: Tensor, some: slice = slice(None, None, every)) -> Quadratic:
+                return self._about(decoder, points[shapes, some], sdf[shapes, some], at)
+
+            codes, damping, _ = descend(about, codes, damping, self.steps, self.tolerance)
+        return codes
 
     def _about(self, decoder, points: Tensor, sdf: Tensor, codes: Tensor) -> Quadratic:
         """The objective of samples [B, N] about codes [B, L]."""
@@ -203,13 +172,6 @@ class GaussNewtonFit:
             gradient=(weighted @ residual[..., None]).squeeze(-1) + 2 * prior * codes,
             hessian=hessian,
         )
-
-
-def _step(gradient: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
-    """Where to go [B, L]: the minimum of a quadratic, shortened by damping [B]."""
-    diagonal = hessian.diagonal(dim1=1, dim2=2)
-    damped = hessian + torch.diag_embed((damping * diagonal.mean(1))[:, None].expand_as(diagonal))
-    return -torch.linalg.solve_ex(damped, gradient).result  # unlike solve, lets what is no number pass
 
 
 def field_and_jacobian(decoder: Decoder, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:

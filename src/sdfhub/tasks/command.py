@@ -13,6 +13,7 @@ TASKS = {
     "sample": "new shapes of a space: sdfhub sample run=RUN n=8",
     "neighbours": "the shapes most like one: sdfhub neighbours run=RUN of=ID",
     "import-deepsdf": "an experiment of DeepSDF's code becomes a run: sdfhub import-deepsdf EXPERIMENT_DIR",
+    "reconstruct": "finds the shapes behind scans: sdfhub reconstruct run=RUN target=scan.ply",
     "report": "tables, claims and a page from a sweep's folder: sdfhub report outputs/sweeps/table_small",
 }
 

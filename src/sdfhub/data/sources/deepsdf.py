@@ -125,7 +125,7 @@ def read_samples(path: Path) -> ShapeSamples:
 
 
 def _rows(path: Path, name: str) -> np.ndarray:
-    rows = _array(path, name)
+    rows = npz_array(path, name)
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise RejectedMesh("corrupt_file", f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]")
     rows = rows.astype(np.float32)
@@ -144,7 +144,7 @@ def frame_of(path: Path) -> tuple[np.ndarray, float] | None:
     beside = _frame_file(path)
     if beside is None:
         return None
-    offset, scale = _array(beside, "offset").ravel(), _array(beside, "scale").ravel()
+    offset, scale = npz_array(beside, "offset").ravel(), npz_array(beside, "scale").ravel()
     is_finite = bool(np.isfinite([*offset, *scale]).all())
     if offset.shape != (3,) or scale.shape != (1,) or not is_finite or scale[0] <= 0:
         raise RejectedMesh("corrupt_file", f"{beside}: no offset [3] and positive scale")
@@ -161,7 +161,7 @@ def _fingerprint(path: Path) -> str:
     return " ".join(state_of(file) for file in (path, beside) if file)
 
 
-def _array(path: Path, name: str) -> np.ndarray:
+def npz_array(path: Path, name: str) -> np.ndarray:
     """One floating-point array of an .npz, its size checked before anything is allocated."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:

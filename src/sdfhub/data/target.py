@@ -1,0 +1,105 @@
+"""A scan in the frame of a shape space: what is fitted, and the way back to the scan's own frame."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sdfhub.data.evidence import Evidence
+from sdfhub.data.preparation import Preparation
+from sdfhub.data.sampling import prepare_mesh
+from sdfhub.data.scan import Scan
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import RADIUS, Observation
+
+Frame = Literal["shape", "normalised", "unknown"]
+"""How a scan lies to the normalised frame: as its own bounding box tells, in it, or nobody knows."""
+
+MOST = 2**16
+"""Points of a cloud that are used: a random draw of more."""
+
+LARGEST, SMALLEST = 1.2, 0.2
+"""Distance of the farthest point from the origin that a scan in the normalised frame may have."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """An observed shape.
+
+    Args:
+        kind: samples, oriented, bare or view.
+        count: points of the scan.
+        observation: in the normalised frame, or near it where that is unknown.
+        center: [3] float64, and scale: `scan = observed / scale + center`.
+        scale: as above, > 0.
+    """
+
+    kind: str
+    count: int
+    observation: Observation
+    center: np.ndarray
+    scale: float
+
+
+def observed(scan: Scan, evidence: Evidence, frame: Frame, rng: np.random.Generator) -> Target:
+    """What a scan says of the shape behind it.
+
+    Signed samples lie in the normalised frame as they are; a mesh becomes such samples. A view shows no
+    whole bounding box, so that its frame must be normalised or unknown.
+
+    Raises:
+        SdfhubError: the scan does not fit the frame; RejectedMesh where its mesh cannot be trusted.
+    """
+    if scan.faces is not None:
+        preparation = Preparation(samples=max(4 * evidence.rows, 10_000), surface_points=0)
+        prepared = prepare_mesh((scan.points, scan.faces), preparation)
+        own = Scan(prepared.points.astype(np.float64), sdf=prepared.sdf.astype(np.float64))
+        own = replace(own, center=prepared.center, scale=prepared.scale)
+        if frame == "normalised":  # samples as the mesh lies, not as it would be normalised
+            own = Scan(own.points / own.scale + own.center, sdf=own.sdf / own.scale)
+        return replace(observed(own, evidence, "normalised", rng), count=len(scan.points))
+    if scan.kind == "view" and frame == "shape":
+        raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
+    center, scale = np.zeros(3), 1.0
+    if scan.sdf is None and frame != "normalised":
+        center, scale = box_frame(scan.points)
+    points = (scan.points - center) * scale
+    reach = float(np.linalg.norm(points, axis=1).max())
+    if not SMALLEST <= reach <= (2.5 if scan.sdf is not None else LARGEST):
+        what = "signed samples belong there" if scan.sdf is not None else "give frame=shape if it is whole"
+        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {what}")
+    if scan.sdf is not None:
+        observation = evidence.of_samples(points, scan.sdf, rng)
+        center, scale = (scan.center, scan.scale) if scan.center is not None else (center, scale)
+    elif scan.sensor is not None:
+        points, normals = thinned(points, scan.normals, rng)
+        observation = evidence.of_view(points, normals, (scan.sensor - center) * scale, rng)
+    else:
+        points, normals = thinned(points, scan.normals, rng)
+        observation = evidence.of_cloud(points, normals, rng)
+    return Target("samples" if scan.sdf is not None else scan.kind, len(points), observation, center, scale)
+
+
+def thinned(
+    points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """At most MOST of the points [N, 3] and of their normals."""
+    if len(points) <= MOST:
+        return points, normals
+    kept = rng.permutation(len(points))[:MOST]
+    return points[kept], None if normals is None else normals[kept]
+
+
+def box_frame(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre [3] and scale by which the box of points [N, 3] comes to 0 and the farthest to 1 / 1.03.
+
+    Raises:
+        SdfhubError: they lie in one place, on a line or in a plane, or too far out to be measured.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = high / 2 - low / 2
+    center = low + half
+    farthest = half.max() * np.linalg.norm((points - center) / max(half.max(), 1e-300), axis=1).max()
+    if not np.isfinite(farthest) or half.max() <= 0 or half.min() < 1e-3 * half.max():
+        raise SdfhubError(f"its extents are {2 * half}: no shape with an inside has such")
+    return center, float(RADIUS / farthest)

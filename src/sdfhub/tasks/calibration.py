@@ -1,0 +1,197 @@
+"""When a fit is doubtful: by what unseen shapes of a run's own data leave as residuals, scanned alike.
+
+A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from sdfhub.data.evidence import Evidence
+from sdfhub.data.scan import Scan
+from sdfhub.data.scanning import surface_scan, view_scan
+from sdfhub.data.shards import StoredShape
+from sdfhub.data.splits import Split, split
+from sdfhub.data.store import shape_seed
+from sdfhub.data.target import Target, observed
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks.build import build
+from sdfhub.tasks.prepare import prepare_split
+from sdfhub.whole_file import file_sha256, write_whole
+
+FILE = "calibration.json"
+NOISES = (0.0, 0.005, 0.01, 0.02)
+"""Levels of noise that are calibrated apart, normalised frame."""
+DISTANCE, HEIGHT = 2.5, 0.5
+"""Of simulated sensors from the origin, and how far up they may stand, as a sine."""
+PIXELS = 100
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How thresholds are found.
+
+    Args:
+        shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
+        spread: standard deviations that the logarithm of a residual may lie above the mean of theirs, > 0.
+    """
+
+    shapes: int
+    spread: float
+
+    def __post_init__(self):
+        if (self.shapes < 3 and self.shapes != 0) or self.spread <= 0:
+            raise ValueError("shapes must be at least 3, or 0 for no verdicts, and spread positive")
+
+    def threshold(self, residuals: np.ndarray) -> float:
+        """The residual above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
+        logarithms = np.log(np.maximum(residuals, 1e-12))
+        return float(np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1)))
+
+
+@dataclass(frozen=True)
+class Alike:
+    """What scans have in common that are judged by one threshold: what can be simulated.
+
+    Args:
+        kind: samples, oriented, bare or view.
+        count: points, a power of two; 0 where their number does not matter.
+        noise: one of NOISES.
+    """
+
+    kind: str
+    count: int
+    noise: float
+
+    @classmethod
+    def to(cls, target: Target) -> "Alike":
+        """What a target is like."""
+        if target.kind == "samples":
+            return cls("samples", 0, 0.0)
+        noise = min(NOISES, key=lambda level: abs(level - target.observation.noise))
+        power = np.clip(round(np.log2(target.count)), 6, 16)
+        return cls(target.kind, 0 if target.kind == "view" else int(2**power), noise)
+
+    def __str__(self) -> str:
+        count = f", {self.count} points" if self.count else ""
+        return f"{self.kind}{count}" + (f", noise {self.noise:g}" if self.noise else "")
+
+    def target(self, shape: StoredShape, evidence: Evidence) -> Target:
+        """A simulated scan of a shape, in the normalised frame, observed."""
+        return observed(self.scan(shape), evidence, "normalised", np.random.default_rng(shape_seed(shape)))
+
+    def scan(self, shape: StoredShape) -> Scan:
+        """A simulated scan of a shape, in the normalised frame.
+
+        Raises:
+            SdfhubError: the shape has no mesh to be scanned.
+        """
+        rng = np.random.default_rng(shape_seed(shape))
+        if self.kind == "samples":
+            rows = np.concatenate([shape.outside, shape.inside]).astype(np.float64)
+            return Scan(rows[:, :3], sdf=rows[:, 3])
+        mesh = shape.mesh
+        if mesh is None:
+            raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")
+        if self.kind == "view":
+            sensor = random_sensor(rng, shape.up)
+            return Scan(view_scan(mesh, sensor, PIXELS, self.noise, rng), sensor=sensor)
+        points, normals = surface_scan(mesh, self.count, self.noise, rng)
+        return Scan(points, normals if self.kind == "oriented" else None)
+
+
+def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
+    """[3] a place around the unit ball, not far above or below its middle."""
+    height, turn = rng.uniform(-HEIGHT, HEIGHT), rng.uniform(0, 2 * np.pi)
+    flat = np.sqrt(1 - height**2)
+    x, y, z = flat * np.cos(turn), flat * np.sin(turn), height
+    return DISTANCE * np.array([x, y, z] if up == "z" else [x, z, y])
+
+
+class Fitter(Protocol):
+    """What is calibrated.
+
+    Attributes:
+        evidence: what a scan says.
+    """
+
+    evidence: Evidence
+
+    def residuals(self, targets: Sequence[Target]) -> np.ndarray:
+        """The residuals [B] of targets."""
+
+
+def calibrated(
+    run: Path,
+    trained: dict[str, Any],
+    roles: dict[str, list[str]],
+    calibration: Calibration,
+    kinds: Sequence[Alike],
+    fitter: Fitter,
+    settings: dict[str, Any],
+    data: dict[str, Any],
+) -> dict[Alike, float]:
+    """The threshold of each kind of scan: the run's own, or measured now and kept.
+
+    Args:
+        run: its folder; trained and roles are its config and split.
+        calibration: how.
+        kinds: that are wanted.
+        fitter: fits targets.
+        settings: plain, all that residuals depend on.
+        data: keys that stand in for the run's own (store, workers).
+
+    Raises:
+        SdfhubError: the run's data cannot be had here, or it has too few unseen shapes.
+    """
+    key, kept = _digest(run, settings), _read(run / FILE)
+    known = kept.get(key, {})
+    missing = [each for each in kinds if "threshold" not in known.get(str(each), {})]
+    shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
+    for each in missing:
+        targets = [each.target(shape, fitter.evidence) for shape in shapes]
+        residuals = fitter.residuals(targets)
+        entry = {"threshold": calibration.threshold(residuals), "residuals": residuals.tolist()}
+        known[str(each)] = entry | {"shapes": [shape.id for shape in shapes]}
+        write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+    return {each: float(known[str(each)]["threshold"]) for each in kinds}
+
+
+def unseen_shapes(
+    trained: dict[str, Any], roles: dict[str, list[str]], data: dict[str, Any], count: int
+) -> list[StoredShape]:
+    """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source."""
+    data = trained["data"] | {name: value for name, value in data.items() if value is not None}
+    source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    offered = {shape.id: shape for shape in source.shapes()}
+    first = [offered[id] for id in roles["held_out"] if id in offered][:count]
+    used = {*roles["train"], *roles["held_out"]}
+    others = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
+    others = [shape for shape in others if shape.split == "test"] or others
+    more = split(others, 0, min(count - len(first), len(others)), seed=0).test
+    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
+    found = prepare_split(source, Split([], first + more), preparation, data).held_out
+    if len(found) < 3:
+        raise SdfhubError(f"the run's data has {len(found)} unseen shapes, a calibration needs 3")
+    return found
+
+
+def _digest(run: Path, settings: dict[str, Any]) -> str:
+    """What a run's weights and the settings of a fit are told apart by."""
+    weights = file_sha256(run / "checkpoints" / "last.ckpt")
+    text = json.dumps([weights, settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What is kept; nothing where the file is missing or broken, which costs a calibration."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        return {key: {kind: dict(entry) for kind, entry in kinds.items()} for key, kinds in kept.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}

@@ -1,0 +1,121 @@
+"""Task `reconstruct`: the shapes behind scans, found in a trained space, as meshes in the scans' frames."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from omegaconf import DictConfig
+from pydantic import Field
+from tqdm import tqdm
+
+from sdfhub.data.scan import FORMATS
+from sdfhub.data.sources.source import unique_ids
+from sdfhub.data.target import Frame, Target
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.calibration import Alike, calibrated
+from sdfhub.tasks.opening import beside, load
+from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
+from sdfhub.tasks.run import read_run, refuse_unwritable
+
+
+def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
+    """The files to read, those of a folder included, by the names of their results.
+
+    Raises:
+        SdfhubError: a folder holds no scans, or nothing is named.
+    """
+    named: dict[Path, str] = {}
+    for path in map(Path, [wanted] if isinstance(wanted, str) else wanted):
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(each for each in path.rglob("*") if each.suffix.lower() in FORMATS)
+            if not inside:
+                raise SdfhubError(f"target={path}: holds no scans ({' '.join(FORMATS)})")
+        named |= {each: each.stem for each in inside}
+    if not named:
+        raise SdfhubError("target: names no scan")
+    return unique_ids(named)
+
+
+def read_targets(
+    how: Reconstructor, files: dict[str, Path], sensor: Sequence[float] | None
+) -> tuple[dict[str, Target], list[Found]]:
+    """What the files observe, by name, and those that cannot be used."""
+    targets, failed = {}, []
+    for name, path in tqdm(files.items(), desc="reading", unit="scan", leave=False, disable=None):
+        try:
+            targets[name] = how.target(path, sensor)
+        except SdfhubError as error:
+            failed.append(Found(name, reason=str(error)))
+    return targets, failed
+
+
+def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
+    """The space of a run or an exported file, and how it is to be used."""
+    frame = check(config["frame"], Frame, "frame")
+    space = load(run)
+    poses = build(config["poses"], "poses", within="sdfhub.model", up=space.up)
+    return Reconstructor(
+        space,
+        method=build(config["method"], "method", within="sdfhub.model"),
+        evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
+        frame=frame,
+        poses=poses if frame == "unknown" else None,
+        resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
+    )
+
+
+def thresholds_of(
+    run: Path, how: Reconstructor, kinds: Sequence[Alike], config: dict[str, Any]
+) -> dict[Alike, float]:
+    """The thresholds of kinds of scans; none, and a line that says why, where they cannot be had."""
+    calibration = build(config["calibration"], "calibration")
+    if not calibration.shapes:
+        return {}
+    settings = {key: config[key] for key in ("method", "evidence", "calibration")}
+    settings["poses"] = config["poses"] if how.poses else None
+    try:
+        trained, roles = read_run(run)
+        return calibrated(run, trained, roles, calibration, kinds, how, settings, config["data"])
+    except (SdfhubError, OSError, LookupError, TypeError) as error:  # whatever an older run lacks
+        print(f"no verdicts: {error}", file=sys.stderr)
+        return {}
+
+
+def reconstruct_run(config: dict[str, Any]) -> list[Found]:
+    """Finds the shapes behind what `target` names, as `config` (conf/reconstruct.yaml) says."""
+    run = Path(check(config["run"], str, "run"))
+    out = beside(str(run), check(config["out"], str | None, "out"), "reconstructions")
+    sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
+    together = check(config["together"], Annotated[int, Field(ge=1)], "together")
+    files = scan_files(check(config["target"], str | list[str], "target"))
+    for name, path in files.items():
+        if (out / f"{name}.ply").resolve() == path.resolve():
+            raise SdfhubError(f"out={out}: its results would overwrite {path}; choose another folder")
+    how = reconstructor(run, config)
+    refuse_unwritable(out)
+    targets, results = read_targets(how, files, sensor)
+    kinds = list(dict.fromkeys(map(Alike.to, targets.values())))
+    thresholds = thresholds_of(run, how, kinds, config) if targets else {}
+    together = 1 if how.space.device.type == "cpu" else together
+    found = reconstruct_targets(how, targets, thresholds, out, together)
+    results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
+    print(table(results))
+    print(f"\nmeshes and codes: {out}")
+    for each in results:
+        if each.verdict == "failed":
+            print(f"sdfhub: error: {each.reason}", file=sys.stderr)
+    return results
+
+
+def main() -> None:
+    """Console entry: `sdfhub reconstruct run=RUN target=scan.ply`. Exit status 1 if a scan failed."""
+
+    def task(config: DictConfig) -> None:
+        if any(found.verdict == "failed" for found in reconstruct_run(plain(config))):
+            sys.exit(1)
+
+    run_task(task, "reconstruct")

@@ -1,0 +1,203 @@
+"""Scans through a trained space: fitted, meshed in their own frames, judged, written one by one."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from sdfhub.data.evidence import Evidence
+from sdfhub.data.scan import read_scan
+from sdfhub.data.target import Frame, Target, observed
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesher import Mesh
+from sdfhub.model.reconstruction import Fitted, Method
+from sdfhub.model.similarity import PoseRange
+from sdfhub.space import Space
+from sdfhub.tasks.calibration import Alike
+from sdfhub.tasks.mesh_file import write_mesh
+from sdfhub.whole_file import write_whole
+
+
+@dataclass(frozen=True)
+class Reconstructor:
+    """A trained space and how scans are fitted in it.
+
+    Args:
+        space: where codes are looked for.
+        method: finds codes and poses.
+        evidence: what a scan says.
+        frame: of the scans.
+        poses: how far the scans' frames may be off; None where they are known.
+        resolution: points along an axis of the marching-cubes grid, >= 2.
+    """
+
+    space: Space
+    method: Method
+    evidence: Evidence
+    frame: Frame
+    poses: PoseRange | None
+    resolution: int
+
+    def target(self, path: Path, sensor: Sequence[float] | None) -> Target:
+        """The shape that a file observes; the same file gives the same observation.
+
+        Args:
+            path: of a scan.
+            sensor: [3] from where a cloud was seen that does not say so itself, in its frame, or None.
+
+        Raises:
+            SdfhubError: names the file.
+        """
+        scan = read_scan(path)
+        if sensor is not None and scan.kind in ("bare", "oriented"):
+            scan = replace(scan, sensor=np.array(sensor, dtype=np.float64))
+        try:
+            return observed(scan, self.evidence, self.frame, np.random.default_rng(0))
+        except SdfhubError as error:
+            raise SdfhubError(f"{path}: {error}") from error
+
+    def fit(self, targets: Sequence[Target]) -> Fitted:
+        """Codes, residuals and poses of targets, each found as if it were alone."""
+        observations = [each.observation for each in targets]
+        try:
+            return self.method(self.space.decoder, self.space.codes, observations, self.poses)
+        except ValueError as error:
+            raise SdfhubError(f"method: {error}") from error
+
+    def residuals(self, targets: Sequence[Target]) -> np.ndarray:
+        """The residuals [B] of targets whose shapes nobody asked for."""
+        bar = tqdm(targets, desc="calibrating", unit="shape", leave=False, disable=None)
+        return np.array([float(self.fit([each]).residuals) for each in bar])
+
+    def meshes(self, targets: Sequence[Target], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
+        """Meshes in the targets' own frames, and the matrices [4, 4] from the normalised frame to these."""
+        for row, mesh in enumerate(self.space.meshes(fitted.codes, self.resolution)):
+            matrix = to_scan(targets[row], fitted, row)
+            yield (mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]), matrix
+
+
+def to_scan(target: Target, fitted: Fitted, row: int) -> np.ndarray:
+    """[4, 4] float64 matrix from the normalised frame to that of a target's scan."""
+    observed_to_scan, pose = np.eye(4), np.eye(4)
+    observed_to_scan[:3] = np.column_stack([np.eye(3) / target.scale, target.center])
+    if fitted.poses is not None:
+        scale, rotation, shift = (part[row].double().cpu().numpy() for part in fitted.poses)
+        pose[:3] = np.column_stack([scale * rotation, shift])
+    return observed_to_scan @ np.linalg.inv(pose)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found of one scan.
+
+    Args:
+        name: of its files.
+        kind: what it was judged as; empty where it failed.
+        residual: mean violation of the scan's bounds, normalised units.
+        threshold: residual above which the fit is doubtful; None where nothing was calibrated.
+        verdict: fitted, doubtful, unjudged (not calibrated) or failed.
+        reason: of a verdict other than fitted.
+        code: [L] numbers.
+        frame: rows [4][4] of the matrix from the normalised frame to the scan's.
+        mesh: file name; None without a surface.
+    """
+
+    name: str
+    kind: str = ""
+    residual: float | None = None
+    threshold: float | None = None
+    verdict: Literal["fitted", "doubtful", "unjudged", "failed"] = "failed"
+    reason: str = ""
+    code: tuple[float, ...] = ()
+    frame: tuple[tuple[float, ...], ...] = ()
+    mesh: str | None = None
+
+    def judged(self, threshold: float | None, is_near: bool) -> "Found":
+        """The same with a verdict.
+
+        Args:
+            threshold: of residuals of its kind of scan; None where nothing was calibrated.
+            is_near: whether its pose lies within the range of poses.
+        """
+        if self.mesh is None:
+            verdict, reason = "doubtful", "the field has no surface"
+        elif not is_near:
+            verdict, reason = "doubtful", "its pose lies outside the range of poses"
+        elif threshold is None:
+            verdict, reason = "unjudged", "nothing was calibrated"
+        elif not self.residual <= threshold:
+            verdict, reason = "doubtful", "its residual is above that of shapes of this space"
+        else:
+            verdict, reason = "fitted", ""
+        return replace(self, threshold=threshold, verdict=verdict, reason=reason)
+
+
+def reconstruct_targets(
+    how: Reconstructor,
+    targets: dict[str, Target],
+    thresholds: dict[Alike, float],
+    out: Path,
+    together: int,
+) -> Iterator[Found]:
+    """Fits and meshes targets by name and writes NAME.ply and NAME.json of each, as they are found.
+
+    One that fails does not stop the others.
+
+    Args:
+        how: the space.
+        targets: by the names of their files.
+        thresholds: by kind of scan.
+        out: folder.
+        together: targets fitted side by side.
+    """
+    names = list(targets)
+    for first in range(0, len(names), together):
+        group = names[first : first + together]
+        try:
+            yield from _reconstruct_group(how, {name: targets[name] for name in group}, thresholds, out)
+        except SdfhubError as error:
+            yield from (Found(name, reason=str(error)) for name in group)
+
+
+def _reconstruct_group(
+    how: Reconstructor, group: dict[str, Target], thresholds: dict[Alike, float], out: Path
+) -> list[Found]:
+    targets, found = list(group.values()), []
+    fitted = how.fit(targets)
+    near = how.poses.holds(fitted.poses).tolist() if fitted.poses else [True] * len(group)
+    for row, (mesh, matrix) in enumerate(how.meshes(targets, fitted)):
+        name, kind = list(group)[row], Alike.to(targets[row])
+        result = Found(
+            name,
+            kind=str(kind),
+            residual=float(fitted.residuals[row]),
+            code=tuple(fitted.codes[row].tolist()),
+            frame=tuple(map(tuple, matrix.tolist())),
+            mesh=f"{name}.ply" if len(mesh[1]) else None,
+        )
+        found.append(result.judged(thresholds.get(kind), near[row]))
+        _write(found[-1], mesh, out)
+    return found
+
+
+def _write(found: Found, mesh: Mesh, out: Path) -> None:
+    """The mesh first, what is said of it last."""
+    if found.mesh:
+        write_mesh(*mesh, out / found.mesh)
+    write_whole(out / f"{found.name}.json", json.dumps(asdict(found), indent=1))
+
+
+def table(results: Sequence[Found]) -> str:
+    """A line a scan: verdict, residual times 10^3 and its threshold, what it was judged as."""
+    width = max(len("scan"), *(len(each.name) for each in results)) + 2
+    lines = [f"{'scan':<{width}}{'verdict':<10}{'residual x10^3':>15}{'at most':>9}  judged as"]
+    for each in results:
+        numbers = ((each.residual, 15), (each.threshold, 9))
+        cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
+        why = f"; {each.reason}" if each.reason and each.verdict != "failed" else ""
+        lines.append(f"{each.name:<{width}}{each.verdict:<10}{''.join(cells)}  {each.kind}{why}")
+    return "\n".join(lines)

@@ -1,0 +1,174 @@
+"""`sdfhub reconstruct` as a user runs it, in a space of balls that stands in for a trained run."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sdfhub.data.scan import Scan
+from sdfhub.data.target import observed
+from sdfhub.tasks import calibration as calibrations
+from sdfhub.tasks import reconstruct as task
+from sdfhub.tasks.calibration import Alike, Calibration
+from sdfhub.tasks.run import begin_run, build_autodecoder
+from tests.test_config import composed
+from tests.test_reconstruction import ball
+from tests.test_training import batches
+
+SPACE = ["scale=demo", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
+SPACE += ["encoding=none", "data.preparation.samples=4000", "data.preparation.surface_points=2000"]
+QUICK = ["evidence.rows=1200", "evidence.cells=24", "method.thinning=2", "method.probes=64", "resolution=24"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run's folder whose codes are balls of radius 0.4 to 0.55, and whose data are chairs."""
+    folder = tmp_path_factory.mktemp("space") / "run"
+    config = composed(*SPACE, f"data.store={folder.parent / 'store'}", "data.workers=1")
+    model, stream = build_autodecoder(config, rows=4), batches(shapes=4, per_step=4, samples=256, surface=0)
+    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
+    for step in range(250):
+        batch = stream[step]
+        loss = (model(batch.points, batch.rows) - batch.sdf).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    begin_run(
+        folder, config, [f"chairs/000{row}" for row in range(4)], ["chairs/0007", "chairs/0009"], {}, "z"
+    )
+    (folder / "checkpoints").mkdir()
+    torch.save({"state_dict": model.state_dict()}, folder / "checkpoints" / "last.ckpt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Three balls, one of them far away and large, and a file that is none."""
+    folder = tmp_path_factory.mktemp("scans")
+    away = np.random.default_rng(0).standard_normal((2000, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    np.savez(folder / "oriented.npz", points=0.5 * away, normals=away)
+    np.save(folder / "bare.npy", 0.45 * away)
+    seen = ball(0.5)
+    frame = {"center": np.array([100.0, 0, 0]), "scale": np.ones(1) / 20}
+    np.savez(folder / "samples.npz", points=seen.points, sdf=seen.low, **frame)
+    (folder / "broken.xyz").write_text("no numbers\n")
+    return folder
+
+
+def reconstructed(run, *overrides):
+    quick = [*QUICK, f"run={run}", "frame=normalised", *overrides]
+    return task.reconstruct_run(composed(*quick, config_name="reconstruct"))
+
+
+def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path, capsys):
+    results = reconstructed(run, f"target={scans}", f"out={tmp_path}", "calibration.shapes=0")
+    found = {each.name: each for each in results}
+    assert {name: each.verdict for name, each in found.items()} == {
+        "broken": "failed",
+        "bare": "unjudged",
+        "oriented": "unjudged",
+        "samples": "unjudged",
+    }
+    assert "broken.xyz" in capsys.readouterr().err
+    for name, centre, radius in (("bare", 0, 0.45), ("oriented", 0, 0.5), ("samples", [100.0, 0, 0], 10.0)):
+        mesh = trimesh.load_mesh(tmp_path / f"{name}.ply")
+        assert np.abs(np.linalg.norm(mesh.vertices - centre, axis=1) / radius - 1).max() < 0.15
+        said = json.loads((tmp_path / f"{name}.json").read_text())
+        assert len(said["code"]) == 4 and said["residual"] < 0.02 and said["mesh"] == f"{name}.ply"
+        assert said["frame"][3] == [0, 0, 0, 1]
+    assert sorted(path.name for path in tmp_path.iterdir() if "broken" in path.name) == []
+
+
+def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):
+    common = f"out={tmp_path}", "calibration.shapes=0"
+    all_of, alone = (reconstructed(run, f"target={at}", *common) for at in (scans, scans / "bare.npy"))
+    assert [each.code for each in all_of if each.name == "bare"] == [alone[0].code]
+
+
+def test_thresholds_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypatch):
+    """The run's data are chairs, which its space of balls cannot fit: their residuals are large."""
+    first = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
+    kept = json.loads((run / calibrations.FILE).read_text())
+    (entry,) = next(iter(kept.values())).values()
+    assert first[0].verdict == "fitted" and first[0].threshold == entry["threshold"]
+    assert len(entry["residuals"]) == len(entry["shapes"]) == 3
+    assert entry["shapes"][:2] == ["chairs/0007", "chairs/0009"], "the held-out ones first"
+    assert min(entry["residuals"]) > 3 * first[0].residual
+    monkeypatch.setattr(calibrations, "unseen_shapes", None)  # a second measurement would fail
+    again = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
+    assert again == first
+
+
+def test_without_the_runs_data_there_are_meshes_but_no_verdicts(run, scans, tmp_path, monkeypatch, capsys):
+    def gone(*_):
+        raise calibrations.SdfhubError("data.source.root: no such folder")
+
+    monkeypatch.setattr(calibrations, "unseen_shapes", gone)
+    (found,) = reconstructed(run, f"target={scans / 'samples.npz'}", f"out={tmp_path}")
+    assert found.verdict == "unjudged" and found.mesh and "no such folder" in capsys.readouterr().err
+
+
+def test_a_threshold_lies_above_what_it_was_measured_on():
+    residuals = np.exp(np.random.default_rng(0).normal(-6, 0.3, 200))
+    threshold = Calibration(shapes=200, spread=2.5).threshold(residuals)
+    assert (residuals <= threshold).mean() > 0.98 and threshold < 2 * np.exp(-6 + 2.5 * 0.3)
+
+
+def test_scans_are_judged_by_scans_like_them():
+    evidence = task.build(composed("run=-", "target=-", config_name="reconstruct")["evidence"], "evidence")
+    away = np.random.default_rng(0).standard_normal((3000, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    for noise, level in ((0.0, 0.0), (0.011, 0.01)):
+        points = away * (0.6 + noise * np.random.default_rng(1).standard_normal((3000, 1)))
+        target = observed(Scan(points), evidence, "normalised", np.random.default_rng(0))
+        assert Alike.to(target) == Alike("bare", 4096, level)
+
+
+MISTAKES = {
+    "frame=metres": ["frame", "metres"],
+    "method=newton": ["newton", "deepsdf"],
+    "method.nearest=-1": ["method", "negative"],
+    "evidence.cells=2": ["evidence", "cells"],
+    "resolution=1": ["resolution=1"],
+    "sensor=[1,2]": ["sensor"],
+    "target=nowhere.ply": ["nowhere.ply", "no such file"],
+    "prior.shrinkage=2": ["shrinkage"],
+    "calibration.shapes=1": ["calibration", "at least 3"],
+}
+
+
+@pytest.mark.parametrize("override", MISTAKES)
+def test_a_mistake_is_one_line_that_names_it(run, scans, override, monkeypatch, capsys, tmp_path):
+    arguments = [f"run={run}", f"target={scans / 'bare.npy'}", f"out={tmp_path}", override]
+    monkeypatch.setattr(sys, "argv", ["sdfhub", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        task.main()
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert stop.value.code == (1 if override.startswith("target") else 2)
+    assert message.startswith("sdfhub: error: ") and all(word in message for word in MISTAKES[override])
+
+
+def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch, capsys):
+    other = tmp_path / "other"
+    begin_run(other, {"seed": 0, "model": {}}, ["a"], [], {}, "z")
+    (other / "checkpoints").mkdir()
+    (other / "checkpoints" / "last.ckpt").write_bytes((run / "checkpoints" / "last.ckpt").read_bytes())
+    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"target={scans}"])
+    with pytest.raises(SystemExit) as stop:
+        task.main()
+    message = capsys.readouterr().err.strip()
+    assert (
+        stop.value.code == 2
+        and "not a shape space that this version reads" in message
+        and len(message.splitlines()) == 1
+    )
+
+
+def test_results_never_overwrite_a_scan(run, tmp_path):
+    trimesh.creation.icosphere().export(tmp_path / "ball.ply")
+    with pytest.raises(task.SdfhubError, match="overwrite"):
+        reconstructed(run, f"target={tmp_path}", f"out={tmp_path}")

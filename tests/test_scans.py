@@ -1,0 +1,218 @@
+"""Scans: every format gives the same shape, every broken one a line, and no bound excludes the truth."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from sdfhub.data.cloud import is_outside, noise_of, winding
+from sdfhub.data.evidence import Evidence
+from sdfhub.data.free_space import free_space
+from sdfhub.data.normalize import normalize_mesh
+from sdfhub.data.scan import Scan, read_scan
+from sdfhub.data.scanning import surface_scan, view_scan
+from sdfhub.data.target import observed
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import RADIUS
+
+EVIDENCE = {"rows": 3000, "surface": 0.25, "uniform": 0.15, "variances": (0.005, 0.0005), "cells": 40}
+EVIDENCE |= {"certain": 0.2, "background": False, "quiet": 0.003}
+SENSOR = np.array([0.0, -2.4, 0.6])
+
+
+@pytest.fixture(scope="module")
+def box():
+    """A closed box, so that distances and normals are known everywhere."""
+    mesh = trimesh.creation.box((1.0, 0.6, 1.4)).subdivide().subdivide()
+    return normalize_mesh(mesh.vertices, mesh.faces)
+
+
+def true_sdf(box, points):
+    half = box.vertices.max(axis=0)
+    apart = np.abs(points) - half
+    return np.linalg.norm(np.maximum(apart, 0), axis=1) + np.minimum(apart.max(axis=1), 0)
+
+
+def cloud(box, count=3000, noise=0.0, seed=0):
+    return surface_scan(box, count, noise, np.random.default_rng(seed))
+
+
+def excluded(box, observation) -> np.ndarray:
+    """How far the truth lies outside the bounds."""
+    truth = true_sdf(box, observation.points.astype(np.float64))
+    truth = np.where(observation.unsigned, np.abs(truth), truth)
+    return np.maximum(np.maximum(observation.low - truth, truth - observation.high), 0)
+
+
+@pytest.mark.parametrize("with_normals", [True, False])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_bounds_around_a_cloud_hold_the_truth(box, with_normals, noise):
+    points, normals = cloud(box, noise=noise)
+    rng = np.random.default_rng(1)
+    seen = Evidence(**EVIDENCE).of_cloud(points, normals if with_normals else None, rng)
+    wrong = excluded(box, seen)
+    assert len(seen.points) == EVIDENCE["rows"]
+    assert np.mean(wrong > 0.004 + 2 * noise) < 0.03
+    assert np.mean(seen.high - seen.low) < 0.03 + 4 * noise, "they say something"
+    known = ~seen.unsigned & (seen.low > 0.03)
+    assert known.mean() > 0.1
+    if with_normals:
+        assert (seen.high < 0).mean() > 0.1, "normals tell the inside"
+
+
+def test_bounds_of_a_view_hold_the_truth_behind_it(box):
+    rng = np.random.default_rng(0)
+    points = view_scan(box, SENSOR, 60, 0.0, rng)
+    assert np.abs(true_sdf(box, points)).max() < 1e-5
+    assert points[:, 1].max() < box.vertices[:, 1].max() - 0.05, "the far side is not seen"
+    seen = Evidence(**EVIDENCE).of_view(points, None, SENSOR, rng)
+    assert np.mean(excluded(box, seen) > 0.005) < 0.02
+    assert (seen.low > 0.05).mean() > 0.02, "free space keeps surfaces away"
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_free_space_is_never_nearer_to_a_surface_than_it_says(box, background):
+    points = view_scan(box, SENSOR, 60, 0.0, np.random.default_rng(0))
+    empty, clear = free_space(points, SENSOR, 40, background)
+    assert (true_sdf(box, empty) >= clear - 1e-6).all()
+    beside = np.abs(empty[:, 0]) > box.vertices[:, 0].max() + 0.1
+    assert beside.any() == background
+
+
+def test_noise_is_measured_and_none_is_none(box):
+    for noise in (0.005, 0.01, 0.02):
+        assert noise_of(cloud(box, 6000, noise)[0]) == pytest.approx(noise, rel=0.35)
+    assert noise_of(cloud(box, 6000)[0]) < 1e-3
+
+
+def test_only_what_can_be_reached_is_outside(box):
+    points, _ = cloud(box, 6000)
+    at = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    truth = true_sdf(box, at)
+    found = is_outside(points, at, 0.08, 40)
+    assert found[truth > 0.2].all() and not found[truth < 0].any()
+
+
+def test_the_winding_number_of_a_cloud_is_one_inside(box):
+    points, normals = cloud(box, 4000)
+    at = np.random.default_rng(0).uniform(-0.9, 0.9, (300, 3))
+    clear = np.abs(true_sdf(box, at)) > 0.1
+    turns = winding(points, normals, np.full(len(points), surface_area(box) / len(points)), at)
+    assert np.abs(turns - (true_sdf(box, at) < 0))[clear].max() < 0.1
+
+
+def surface_area(box) -> float:
+    return trimesh.Trimesh(box.vertices, box.faces, process=False).area
+
+
+def formats(folder, points, normals):
+    """The same oriented cloud in every format."""
+    rows = np.hstack([points, normals])
+    np.savetxt(folder / "a.xyz", rows)
+    np.save(folder / "a.npy", rows)
+    np.savez(folder / "a.npz", points=points, normals=normals)
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    head += [f"property float {name}" for name in names] + ["end_header\n"]
+    (folder / "a.ply").write_bytes("\n".join(head).encode() + rows.astype("<f4").tobytes())
+    return [folder / f"a.{suffix}" for suffix in ("xyz", "npy", "npz", "ply")]
+
+
+def test_every_format_gives_the_same_cloud(box, tmp_path):
+    points, normals = cloud(box, 200)
+    for path in formats(tmp_path, points, normals):
+        scan = read_scan(path)
+        assert scan.kind == "oriented"
+        assert np.allclose(scan.points, points, atol=1e-6) and np.allclose(scan.normals, normals, atol=1e-6)
+
+
+def test_what_a_file_is_follows_from_what_it_holds(box, tmp_path):
+    points, _ = cloud(box, 200)
+    trimesh.PointCloud(points).export(tmp_path / "bare.ply")
+    trimesh.Trimesh(box.vertices, box.faces, process=False).export(tmp_path / "mesh.ply")
+    np.savez(tmp_path / "view.npz", points=points, sensor=SENSOR)
+    at = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    np.savez(tmp_path / "samples.npz", points=at, sdf=true_sdf(box, at))
+    rows = np.column_stack([at, true_sdf(box, at)]).astype(np.float32)
+    np.savez(tmp_path / "deepsdf.npz", pos=rows[rows[:, 3] >= 0], neg=rows[rows[:, 3] < 0])
+    kinds = {path.stem: read_scan(path).kind for path in tmp_path.iterdir()}
+    wanted = {name: name for name in ("bare", "mesh", "view", "samples")}
+    assert kinds == wanted | {"deepsdf": "samples"}
+
+
+def test_the_shapes_own_box_undoes_any_units(box):
+    points, normals = cloud(box)
+    far = points * 700 + [1e4, 0, -3e3]
+    rng = [np.random.default_rng(0) for _ in range(2)]
+    here, there = (
+        observed(Scan(at, normals), Evidence(**EVIDENCE), "shape", each)
+        for at, each in ((points, rng[0]), (far, rng[1]))
+    )
+    assert np.allclose(here.observation.points, there.observation.points, atol=1e-4)
+    corner = np.linalg.norm((far - there.center) * there.scale, axis=1).max()
+    assert corner == pytest.approx(RADIUS)
+
+
+def test_a_mesh_becomes_its_own_samples(box):
+    source = box.vertices * 3 + 1
+    target = observed(Scan(source, faces=box.faces), Evidence(**EVIDENCE), "shape", np.random.default_rng(0))
+    assert target.kind == "samples" and excluded(box, target.observation).max() < 1e-3
+    assert np.allclose(box.vertices / target.scale + target.center, source, atol=1e-6)
+
+
+WRONG = {
+    "nan.npy": "1 numbers of its points are not finite",
+    "three.npy": "3 points; at least 50",
+    "columns.npy": "expected rows x y z",
+    "objects.npy": "objects",
+    "empty.ply": "empty",
+    "text.ply": "not a PLY file",
+    "cut.ply": "cut off or damaged",
+    "words.xyz": "not rows of numbers",
+    "cut.npz": "cut off or damaged",
+    "keys.npz": "holds vertices; expected",
+    "no_faces.obj": "no faces",
+    "chair.docx": "not a format",
+    "one_side.npz": "both sides",
+}
+
+
+def write_broken(path, points):
+    """A file that is wrong in the way its name says."""
+    bad = points.copy()
+    bad[3, 1] = np.nan
+    arrays = {"nan": bad, "three": points[:3], "columns": points[:, :2]}
+    arrays["objects"] = np.array([{}], dtype=object)
+    archives = {"keys": {"vertices": points}, "one_side": {"points": points, "sdf": np.ones(len(points))}}
+    texts = {"empty": "", "text": "a chair\n", "words": "a b c\n", "no_faces": "v 0 0 0\nv 1 0 0\n"}
+    if path.name == "cut.ply":
+        path.write_bytes(trimesh.PointCloud(points).export(file_type="ply")[:900])
+    elif path.stem in arrays:
+        np.save(path, arrays[path.stem], allow_pickle=True)
+    elif path.stem in archives:
+        np.savez(path, **archives[path.stem])
+    else:
+        path.write_text(texts.get(path.stem, "PK\x03\x04 and no more"))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_broken_file_is_one_line_that_names_it(box, tmp_path, name):
+    write_broken(tmp_path / name, cloud(box, 200)[0])
+    with pytest.raises(SdfhubError) as stop:
+        read_scan(tmp_path / name)
+    assert WRONG[name] in str(stop.value) and name in str(stop.value)
+    assert "\n" not in str(stop.value)
+
+
+@pytest.mark.parametrize(
+    ("points", "sensor", "frame", "words"),
+    [
+        (500.0, None, "normalised", "frame=shape"),
+        (0.01, None, "normalised", "frame=shape"),
+        ([1.0, 1.0, 0.0], None, "shape", "extents"),
+        (1.0, SENSOR, "shape", "frame=unknown"),
+    ],
+)
+def test_a_scan_that_does_not_fit_its_frame_says_what_would(box, points, sensor, frame, words):
+    scan = Scan(cloud(box, 200)[0] * points, sensor=sensor)
+    with pytest.raises(SdfhubError, match=words):
+        observed(scan, Evidence(**EVIDENCE), frame, np.random.default_rng(0))
