@@ -103,14 +103,26 @@ def test_a_fit_to_samples_of_an_unseen_ball_finds_its_field(space):
     assert torch.equal(code, space.fit(points=points.numpy(), sdf=sdf.numpy()))
 
 
+@pytest.mark.parametrize("oriented", [True, False], ids=["oriented", "bare"])
+def test_a_fit_to_the_surface_of_an_unseen_ball_finds_its_field(space, oriented):
+    normals = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+    code = space.fit(points=0.475 * normals, normals=normals if oriented else None)
+    assert space.sdf(0.475 * normals, code).abs().mean() < 0.015
+
+
+POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (64, 3))
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"points": np.zeros((5, 3))}, "sdf="),
-        ({"points": np.zeros((5, 2)), "sdf": np.zeros(5)}, r"\[N, 3\]"),
-        ({"points": np.zeros((5, 3)), "sdf": np.zeros(4)}, r"\[5, 3\] and \[4\]"),
-        ({"points": np.zeros((0, 3)), "sdf": np.zeros(0)}, "at least 1"),
-        ({"points": np.full((5, 3), np.nan), "sdf": np.zeros(5)}, "finite"),
+        ({"points": POINTS[:5]}, "5 points"),
+        ({"points": POINTS[:, :2]}, r"\[N, 3\]"),
+        ({"points": POINTS, "sdf": np.zeros(4)}, r"\[64\] numbers, they are \[4\]"),
+        ({"points": POINTS, "sdf": np.ones(64)}, "one side"),
+        ({"points": POINTS * np.nan}, "not finite"),
+        ({"points": POINTS * 20}, "from the origin"),
+        ({"points": POINTS, "sdf": POINTS[:, 0], "normals": POINTS}, "not both"),
     ],
 )
 def test_a_fit_refuses_what_it_cannot_fit(space, given, message):

@@ -4,7 +4,7 @@
 >>> space.ids[0], space.codes.shape
 ('balls/small', torch.Size([4, 4]))
 >>> vertices, faces = space.mesh("balls/small", resolution=32)
->>> points = torch.zeros(10, 3, requires_grad=True)
+>>> points = (2 * torch.rand(2000, 3) - 1).requires_grad_()
 >>> distances = space.sdf(points, "balls/small")
 >>> outward = torch.autograd.grad(distances.sum(), points)[0]
 >>> code = space.fit(points=points.detach(), sdf=distances.detach())
@@ -28,12 +28,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sdfhub.data.evidence import Evidence
+from sdfhub.data.scan import Scan
+from sdfhub.data.target import observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
 from sdfhub.model.computing import Computing
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.distribution import CodeDistribution
-from sdfhub.model.fitting import Fit
+from sdfhub.model.reconstruction import Method
 from sdfhub.shapes import NORMALIZED, Frame, check_id
 
 Array = np.ndarray | Tensor
@@ -53,7 +56,8 @@ class Space:
         up: the axis that points up in the source's frame, for pictures.
         config: what the training was composed of: plain data.
         metrics: what `metrics.json` of the run holds; None where nothing was judged.
-        how_to_fit: finds the codes of other shapes.
+        evidence: what a scan of another shape says.
+        method: finds the code behind it.
     """
 
     decoder: Decoder
@@ -63,7 +67,8 @@ class Space:
     up: Literal["y", "z"]
     config: dict[str, Any]
     metrics: dict[str, Any] | None
-    how_to_fit: Fit
+    evidence: Evidence
+    method: Method
 
     def __post_init__(self):
         for id in self.ids:
@@ -162,29 +167,33 @@ class Space:
     def fit(
         self, points: Array, normals: Array | None = None, sdf: Array | None = None, seed: int = 0
     ) -> Tensor:
-        """The code [L] of a shape that the space has not seen.
+        """The code [L] of a shape that the space has not seen, by MAP estimation.
 
         Args:
-            points: [N, 3], normalised frame.
-            normals: [N, 3] outward unit normals of surface points.
-            sdf: [N] signed distances, negative inside; None where the points lie on the surface.
-            seed: of the start.
+            points: [N, 3], normalised frame: all over the surface where `sdf` is not given.
+            normals: [N, 3] outward normals of surface points.
+            sdf: [N] signed distances at the points, negative inside, of both sides.
+            seed: of the choice of points.
+
+        Raises:
+            SdfhubError: they do not tell a shape; says why.
         """
-        if sdf is None or normals is not None:
-            raise SdfhubError("fit: takes signed distances: give sdf=, and no normals")
-        points, sdf = self._tensor(points), self._tensor(sdf)
-        if points.dim() != 2 or points.shape[-1] != 3 or sdf.shape != points.shape[:1] or not len(sdf):
-            what = f"{list(points.shape)} and {list(sdf.shape)}"
-            raise SdfhubError(f"fit: expected points [N, 3] and sdf [N], N at least 1, got {what}")
-        if not (torch.isfinite(points).all() and torch.isfinite(sdf).all()):
-            raise SdfhubError("fit: points and sdf must be finite")
+        if sdf is not None and normals is not None:
+            raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
+        try:
+            scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
+        except ValueError as error:
+            raise SdfhubError(f"fit: {error}") from error
+        return self.fit_scan(scan, "normalised", seed)
 
-        def draw(step: int) -> tuple[Tensor, Tensor]:
-            random = torch.Generator().manual_seed(seed + step)
-            rows = torch.randperm(len(sdf), generator=random)[: self.how_to_fit.samples].to(self.device)
-            return points[None, rows], sdf[None, rows]
+    def fit_scan(self, scan: Scan, frame: Literal["shape", "normalised"], seed: int = 0) -> Tensor:
+        """The code [L] of a scanned shape, whose frame its own bounding box tells or is the normalised one.
 
-        return self.how_to_fit(self.decoder, draw, [seed])[0]
+        Raises:
+            SdfhubError: the scan does not fit the frame, or its mesh cannot be trusted.
+        """
+        target = observed(scan, self.evidence, frame, np.random.default_rng(seed))
+        return self.method(self.decoder, self.codes, [target.observation]).codes[0]
 
     def interpolate(self, a: Shape, b: Shape, steps: int) -> Tensor:
         """Codes [steps, L] in equal steps along the line from a to b, both included; steps >= 2."""
@@ -222,6 +231,10 @@ class Space:
 
     def _tensor(self, array: Array) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+
+
+def _numbers(array: Array | None) -> np.ndarray | None:
+    return None if array is None else torch.as_tensor(array).detach().cpu().double().numpy()
 
 
 def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:

@@ -16,9 +16,10 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from sdfhub.data.evidence import Evidence
 from sdfhub.errors import SdfhubError
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.fitting import Fit
+from sdfhub.model.reconstruction import Method
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
 from sdfhub.tasks.app import configuration_folder
@@ -47,7 +48,7 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")
     about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
-    where = _device(device)
+    where, (evidence, method) = _device(device), default_fitting()
     try:
         ids = tuple(about["ids"])
         frames = about["frames"].items()
@@ -59,7 +60,8 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
             up=about["up"],
             config=about["config"],
             metrics=about["metrics"],
-            how_to_fit=default_fit(),
+            evidence=evidence,
+            method=method,
         )
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise SdfhubError(f"{path}: not a shape space that this version reads: {error}") from error
@@ -94,10 +96,16 @@ def trained_decoder(node: Mapping[str, Any], weights: Mapping[str, Tensor], path
     return decoder.requires_grad_(False)
 
 
-def default_fit() -> Fit:
-    """The fit of `conf/fit/gauss_newton.yaml`."""
-    node = yaml.safe_load((configuration_folder() / "fit" / "gauss_newton.yaml").read_text(encoding="utf-8"))
-    return build(node, "fit", within="sdfhub.model")
+def default_fitting() -> tuple[Evidence, Method]:
+    """What `sdfhub reconstruct` takes by default: the evidence of a scan, and the method."""
+    evidence, method, prior = (
+        yaml.safe_load((configuration_folder() / file).read_text(encoding="utf-8"))
+        for file in ("reconstruct.yaml", "method/map.yaml", "prior/gaussian.yaml")
+    )
+    return (
+        build(evidence["evidence"], "evidence", within="sdfhub.data"),
+        build(method | {"prior": prior}, "method", within="sdfhub.model"),
+    )
 
 
 def beside(run: str, out: str | None, name: str) -> Path:
