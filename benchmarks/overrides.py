@@ -47,7 +47,7 @@ class Started(Exception):
 class Ball:
     """A prepared shape that is not there."""
 
-    mesh, up, seconds, statistics = None, "z", 0.0, {}
+    mesh, up, seconds, statistics, center, scale = None, "z", 0.0, {}, np.zeros(3), 1.0
 
     def __init__(self, id: str):
         self.id, self.category, self.fingerprint = id, "ball", id

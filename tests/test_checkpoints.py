@@ -217,6 +217,26 @@ def test_what_is_no_checkpoint_is_refused_by_name(content, tmp_path):
         read_weights(tmp_path / "last.ckpt")
 
 
+class Stranger:
+    """Touches a file where it is unpickled."""
+
+    def __init__(self, canary: Path):
+        self.canary = canary
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.canary}",)
+
+
+def test_a_strangers_checkpoint_runs_no_code(tmp_path):
+    path, canary = tmp_path / "last.ckpt", tmp_path / "canary"
+    for content in (Stranger(canary), {"state_dict": {"codes.table": Stranger(canary)}}):
+        torch.save(content, path)
+        for read in (read_weights, WholeFileIO().load_checkpoint):
+            with pytest.raises(SdfhubError, match="not a readable checkpoint"):
+                read(path)
+    assert not canary.exists()
+
+
 def test_a_checkpoint_that_claims_more_numbers_than_it_holds_is_refused(tmp_path):
     claim = torch.zeros(1).expand(10**12, 8)
     torch.save({"state_dict": {"codes.table": claim}}, tmp_path / "last.ckpt")

@@ -89,6 +89,22 @@ def test_a_zip_bomb_is_refused(furniture, monkeypatch):
         source.load(shape)
 
 
+def test_a_library_whose_packed_bytes_are_damaged_is_named(furniture):
+    source = OpenSource({"chairs": CATEGORIES["chairs"]}, str(furniture))
+    shape, path = source.shapes()[0], furniture / "a.sh3f"
+    content = bytearray(path.read_bytes())
+    at = content.index(b"shop/stool/stool.obj") + 20
+    content[at : at + 9] = b"\xff" * 9
+    path.write_bytes(content)
+    with pytest.raises(RejectedMesh, match=r"a\.sh3f.*stool\.obj"):
+        source.load(shape)
+    at = content.index(b"PluginFurnitureCatalog.properties") + 33
+    content[at : at + 9] = b"\xff" * 9
+    path.write_bytes(content)
+    with pytest.raises(SdfhubError, match=r"a\.sh3f: not a furniture library"):
+        source.shapes()
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

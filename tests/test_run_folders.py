@@ -40,7 +40,7 @@ def test_results_that_could_not_be_written_are_told_before_the_evaluation(tmp_pa
     trained = composed()
     with (
         patch.object(evaluate_task, "read_run", lambda run: (trained, {"train": [], "held_out": []})),
-        patch.object(evaluate_task, "load_autodecoder", lambda *_: None),
+        patch.object(evaluate_task, "load", lambda run: None),
         patch.object(evaluate_task, "prepare_split", lambda *_: pytest.fail("prepared")),
         pytest.raises(SdfhubError, match="out: cannot be written"),
     ):
