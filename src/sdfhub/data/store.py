@@ -14,9 +14,9 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -26,10 +26,14 @@ from sdfhub.data import shards
 from sdfhub.data.manifest import MANIFEST, VERSION, enter, new_manifest, read_manifest, write_manifest
 from sdfhub.data.sampling import Preparation, prepare_mesh
 from sdfhub.data.shards import StoredShape
-from sdfhub.data.sources.source import Shape, Source
+from sdfhub.data.sources.source import Shape, Source, state_of
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import ShapeSamples
+from sdfhub.whole_file import write_whole
+
+COMPARED = ".compared.json"
+"""Beside the manifest: sizes and dates of files whose checksums were right. Without it all are compared."""
 
 PASSING = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
@@ -111,8 +115,8 @@ def prepare(
     """The store holding `shapes`, preparing those that it lacks.
 
     A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its files are no
-    longer those that were written: each is read once and its checksum compared. Its randomness derives
-    from its id and fingerprint, so neither the order nor the number of workers matters.
+    longer those that were written: checksums are compared where a size or date has changed. Its randomness
+    derives from its id and fingerprint, so neither the order nor the number of workers matters.
 
     Args:
         source: picklable; loads the shapes.
@@ -225,16 +229,42 @@ def _crash_record(shape: Shape) -> dict:
 
 
 def _damaged(shapes: list[Shape], manifest: dict, folder: Path) -> list[str]:
-    """Ids of the shapes whose files are not those that were prepared; told by name."""
+    """Ids of the shapes whose files are not those that were prepared; told by name.
+
+    Files with the size and date that they had when they were last compared are not read again: a thousand
+    shapes are ten gigabytes.
+    """
     records = {shape.id: manifest["shapes"].get(shape.id) for shape in shapes}
-    records = {id: record for id, record in records.items() if record}
+    states = {id: _state(folder / id, record) for id, record in records.items() if record}
+    compared = _compared(folder)
+    fresh = [id for id, state in states.items() if state is None or compared.get(id) != state]
     with ThreadPoolExecutor() as pool:  # hashing lets other threads run
-        found = pool.map(shards.damaged_files, [folder / id for id in records], records.values())
-    names = {id: wrong for id, wrong in zip(records, found, strict=True) if wrong}
+        found = pool.map(shards.damaged_files, [folder / id for id in fresh], [records[id] for id in fresh])
+    names = {id: wrong for id, wrong in zip(fresh, found, strict=True) if wrong}
     for id, wrong in names.items():
         files = ", ".join(f"{name}.npy" for name in wrong)
         print(f"store: {folder / id}: {files} damaged (checksum): prepared again", flush=True)
+    if fresh:
+        compared |= {id: states[id] for id in fresh if id not in names}
+        with suppress(OSError):  # a store that others own is read all the same
+            write_whole(folder / COMPARED, json.dumps(compared))
     return list(names)
+
+
+def _compared(folder: Path) -> dict[str, str]:
+    """States of shapes when their checksums were last compared."""
+    try:
+        return dict(json.loads((folder / COMPARED).read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _state(folder: Path, record: Mapping) -> str | None:
+    """Sizes and dates of a shape's files; None where one is missing."""
+    try:
+        return " ".join(state_of(folder / f"{name}.npy") for name in sorted(record["files"]))
+    except OSError:
+        return None
 
 
 def _refuse_detours(shapes: list[Shape], folder: Path) -> None:
