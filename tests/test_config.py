@@ -57,7 +57,7 @@ def test_every_choice_of_reconstruct_composes_and_builds(group, choice):
 
 def test_issue_groups_are_all_there():
     wanted = {
-        "activation": {"relu", "siren", "hosc"},
+        "activation": {"relu", "siren", "hosc", "finer", "gauss", "wire"},
         "encoding": {"none", "fourier", "gaussian", "hash"},
         "normals": {"on", "off"},
         "category": {"chairs", "lamps", "planes", "sofas", "tables", "all"},
@@ -106,10 +106,10 @@ def test_normals_off_asks_for_no_surface_points():
 
 
 MISTAKES = {
-    "activation=hosk": ["hosk", "hosc relu siren"],
+    "activation=hosk": ["hosk", "finer gauss hosc relu siren wire"],
     "activaton=hosc": ["activaton", "did you mean 'activation'"],
     "activation.betta=3": ["betta", "did you mean 'activation.beta'"],
-    "activation.sharpness=3": ["sharpness", "activation.omega_0, activation.omega_hidden, activation.beta"],
+    "activation.sharpness=3": ["sharpness", "activation.omega_0, activation.omega_hidden", "activation.beta"],
     "+foo=3": ["foo"],
     "activation.beta=abc": ["activation.beta", "abc"],
     "activation.beta=-1": ["beta", "positive"],

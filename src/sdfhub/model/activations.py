@@ -56,6 +56,10 @@ class Activation(nn.Module, ABC):
     def weight_bound(self, fan_in: int) -> float:
         """Half-width b of U(-b, b), the initial weights of the layer before, for `fan_in` inputs."""
 
+    def bias_bound(self) -> float | None:
+        """Half-width of the initial biases before it; None keeps PyTorch's, U(+-1/sqrt(fan_in))."""
+        return None
+
     def monitored(self) -> dict[str, float]:
         """Numbers worth a curve while training, by name; none by default."""
         return {}
@@ -161,3 +165,43 @@ class Hosc(Siren):
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega, "beta": self.beta.item()}
+
+
+class Finer(Activation):
+    """sin(omega (|x| + 1) x): a sine whose frequency grows away from zero, so that biases choose frequencies.
+
+    Initialised as SIREN is, but for the first layer's biases, which are spread over U(-k, k). The authors'
+    code holds |x| + 1 fixed while it differentiates; here it is differentiated, because a normal is the
+    field's own slope.
+
+    Source: Liu et al. 2024, equations 6 and 7 (FINER).
+
+    Args:
+        omega_0: frequency factor of the first layer at x = 0, > 0.
+        omega_hidden: frequency factor of every other layer at x = 0, > 0.
+        k: half-width of the first layer's initial biases, > 0; frequencies reach (2k + 1) omega.
+        first: whether it follows the layer that reads the encoded points.
+    """
+
+    def __init__(self, omega_0: float, omega_hidden: float, k: float, first: bool = False):
+        super().__init__(first)
+        self.omega, self.k = omega_0 if first else omega_hidden, k
+        if min(self.omega, k) <= 0:
+            raise ValueError(f"omega_0, omega_hidden and k must be positive, got {self.omega} and {k}")
+
+    def weight_bound(self, fan_in: int) -> float:
+        return 1 / fan_in if self.first else math.sqrt(6 / fan_in) / self.omega
+
+    def bias_bound(self) -> float | None:
+        return self.k if self.first else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.sin(self.omega * (x.abs() + 1) * x)
+
+    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        size = x.abs()
+        angle = self.omega * (size + 1) * x
+        return torch.sin(angle), self.omega * (2 * size + 1) * torch.cos(angle)
+
+    def monitored(self) -> dict[str, float]:
+        return {"omega": self.omega}

@@ -121,6 +121,8 @@ class Decoder(nn.Module):
         for layer, activation in zip(self.layers, self.activations, strict=False):
             bound = activation.weight_bound(layer.linear.in_features)
             layer.linear.weight.uniform_(-bound, bound)
+            if (bound := activation.bias_bound()) is not None:
+                layer.linear.bias.uniform_(-bound, bound)
         head = self.layers[-1].linear
         head.weight.normal_(0, HEAD_SPREAD / head.in_features**0.5)
         head.bias.zero_()
