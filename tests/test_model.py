@@ -5,11 +5,10 @@ from functools import partial
 import pytest
 import torch
 
-from sdfhub.model.activations import Finer, Hosc, Relu, Siren
+from sdfhub.model.activations import Finer, Gauss, Hosc, Relu, Siren, Wire
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
-from sdfhub.model.wavelets import Gauss, Wire
 
 ACTIVATIONS = {
     "relu": Relu,

@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from sdfhub.model.activations import Finer, Siren
+from sdfhub.model.activations import Finer, Gauss, Siren, Wire
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.encodings import Identity
-from sdfhub.model.wavelets import Gauss, Wire
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed, parameters
 from tests.test_model import ACTIVATIONS, small_decoder
