@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from sdfhub.model.activations import Hosc, Relu, Siren
+from sdfhub.model.activations import Finer, Gauss, Hosc, Relu, Siren, Wire
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
@@ -14,6 +14,9 @@ ACTIVATIONS = {
     "relu": Relu,
     "siren": partial(Siren, omega_0=3.0, omega_hidden=2.0),
     "hosc": partial(Hosc, omega_0=3.0, omega_hidden=2.0, beta=2.0),
+    "finer": partial(Finer, omega_0=3.0, omega_hidden=2.0, k=0.5),
+    "gauss": partial(Gauss, a=0.5),
+    "wire": partial(Wire, omega_0=3.0, omega_hidden=2.0, s=1.0),
 }
 ENCODINGS = {
     "none": Identity,

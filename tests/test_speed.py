@@ -211,7 +211,7 @@ def test_resident_samples_give_the_batches_of_the_store(copies):
             torch.testing.assert_close(have, want, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("choice", ["hosc", "siren", "relu"])
+@pytest.mark.parametrize("choice", CHOICES)
 def test_value_and_gradient_compile_to_one_graph(choice):
     decoder = small_decoder(CHOICES[choice], Fourier(2))
     points, codes = torch.rand(2, 7, 3) - 0.5, torch.randn(2, 4)

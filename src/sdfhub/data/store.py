@@ -145,6 +145,39 @@ def prepare(
     return store
 
 
+def prepare_part(
+    source: Source,
+    shapes: list[Shape],
+    preparation: Preparation,
+    root: str | Path,
+    workers: int | None = None,
+    progress: bool = True,
+) -> int:
+    """Prepares some of a store's shapes; several processes or machines may do so side by side.
+
+    Only the shapes' folders are written: the next call of `prepare` takes them over into the manifest, which
+    costs no more than reading their records.
+
+    Args:
+        shapes: this part's own; the other arguments are those of `prepare`.
+
+    Returns:
+        How many were prepared; the others were there.
+
+    Raises:
+        SdfhubError: the store cannot be written.
+    """
+    folder = Path(root) / source.name / preparation_hash(preparation)
+    try:
+        with _locked(folder, shared=True):
+            _refuse_detours(shapes, folder)
+            manifest = read_manifest(folder) or new_manifest(source.name, preparation)
+            left = _left_after_folders(shapes, manifest, folder)
+            return sum(1 for _ in _results(source, left, preparation, folder, workers, progress))
+    except OSError as error:
+        raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
+
+
 def preparation_hash(preparation: Preparation) -> str:
     """12 hex digits that change with every setting of the preparation and with VERSION."""
     settings = json.dumps([VERSION, dataclasses.asdict(preparation)], sort_keys=True)
@@ -200,11 +233,26 @@ def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> di
     manifest = read_manifest(folder) or new_manifest(source.name, preparation)
     for id in damaged:
         manifest["shapes"].pop(id, None)
+    left = _left_after_folders(shapes, manifest, folder)
+    try:
+        for index, record in _results(source, left, preparation, folder, workers, progress):
+            is_crash = isinstance(record, Crashed)
+            enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
+    finally:  # a run that is interrupted keeps what it has
+        write_manifest(folder, manifest)
+    return manifest
+
+
+def _left_after_folders(shapes: list[Shape], manifest: dict, folder: Path) -> list[Shape]:
+    """The shapes that neither the manifest nor a folder holds; what folders hold enters the manifest."""
     for shape in _missing(shapes, manifest):
         record = shards.read_record(folder / shape.id)
         if record:
             enter(manifest, shape.id, record)
-    left = _missing(shapes, manifest)
+    return _missing(shapes, manifest)
+
+
+def _results(source, left, preparation, folder, workers, progress) -> Iterator[tuple[int, dict | Crashed]]:
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
     function = _PrepareShape(source, preparation, folder)
     if workers == 1:
@@ -212,14 +260,7 @@ def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> di
     else:
         results = map_in_processes(function, left, workers)
     quiet = None if progress else True  # None: no bar where nobody watches
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet)
-    try:
-        for index, record in bar:
-            is_crash = isinstance(record, Crashed)
-            enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
-    finally:  # a run that is interrupted keeps what it has
-        write_manifest(folder, manifest)
-    return manifest
+    return iter(tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet))
 
 
 def _crash_record(shape: Shape) -> dict:
@@ -286,18 +327,22 @@ def _missing(shapes: list[Shape], manifest: dict) -> list[Shape]:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lets one process at a time fill a store; where locks do not work, renames alone keep it whole."""
+def _locked(folder: Path, shared: bool = False) -> Iterator[None]:
+    """Lets one process at a time fill a store, or several that prepare parts of it (`shared`).
+
+    Where locks do not work, renames alone keep it whole.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
+    with (folder / ".lock").open("w+") as file:
         try:
             import fcntl
 
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, kind | fcntl.LOCK_NB)
             except BlockingIOError:
                 print(f"store: {folder}: waiting for another process that prepares it", flush=True)
-                fcntl.flock(file, fcntl.LOCK_EX)
+                fcntl.flock(file, kind)
         except (ImportError, OSError):
             pass
         yield

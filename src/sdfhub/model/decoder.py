@@ -44,8 +44,12 @@ class Layer(nn.Module):
                 shift = F.linear(codes, from_code, self.linear.bias)[:, None]
         return F.linear(inputs, from_points), shift
 
-    def pullback(self, cotangent: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's."""
+    def pullback(self, cotangent: Tensor, codes: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's.
+
+        Args:
+            codes: [B, L], for layers that are scaled by them; this one is not.
+        """
         parts = self.linear.weight.split(self.columns, dim=1)[:2]
         return tuple(cotangent @ part if part.shape[1] else None for part in parts)
 
@@ -68,6 +72,7 @@ class Decoder(nn.Module):
         weight_norm: whether hidden layers are split into direction and length.
         dropout: probability in [0, 1) of dropping a hidden unit while training.
         tanh: whether the output passes through tanh, as in DeepSDF's code.
+        conditioning: makes the layers, and so decides how a code enters them.
     """
 
     def __init__(
@@ -83,6 +88,7 @@ class Decoder(nn.Module):
         weight_norm: bool = True,
         dropout: float = 0.0,
         tanh: bool = False,
+        conditioning: Callable[..., Layer] = Layer,
     ):
         super().__init__()
         if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
@@ -109,7 +115,7 @@ class Decoder(nn.Module):
                     f"width {width} leaves no room for {after} re-injected features; "
                     "widen it, encode with fewer features, or set shorten=false"
                 )
-            self.layers.append(Layer(hidden, encoded, code, outputs))
+            self.layers.append(conditioning(hidden, encoded, code, outputs))
             hidden = outputs
         self._initialize()
         if weight_norm:
@@ -121,6 +127,8 @@ class Decoder(nn.Module):
         for layer, activation in zip(self.layers, self.activations, strict=False):
             bound = activation.weight_bound(layer.linear.in_features)
             layer.linear.weight.uniform_(-bound, bound)
+            if (bound := activation.bias_bound()) is not None:
+                layer.linear.bias.uniform_(-bound, bound)
         head = self.layers[-1].linear
         head.weight.normal_(0, HEAD_SPREAD / head.in_features**0.5)
         head.bias.zero_()
@@ -173,7 +181,7 @@ class Decoder(nn.Module):
             cotangent = (1 - sdf * sdf)[..., None]
         by_encoding = torch.zeros_like(encoded)
         for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
-            by_hidden, part = layer.pullback(cotangent)
+            by_hidden, part = layer.pullback(cotangent, codes)
             by_encoding = by_encoding if part is None else by_encoding + part
             cotangent = None if slope is None else by_hidden * slope
         with torch.autocast(points.device.type, enabled=False):

@@ -4,6 +4,7 @@ import os
 import re
 import sys
 import uuid
+import warnings
 from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
@@ -16,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.names import cell_name, run_name, run_stamp, sweep_name
+from sdfhub.tasks.search import trials_left
 
 
 def configuration_folder() -> Path:
@@ -26,8 +28,10 @@ def configuration_folder() -> Path:
 
 
 def register_resolvers() -> None:
-    """Makes the names of folders and `${unique:}` known to the configs."""
-    for name in (run_name, run_stamp, sweep_name, cell_name):
+    """Makes the functions that configs call known to them, here or in a launcher's worker."""
+    # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
+    warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
+    for name in (run_name, run_stamp, sweep_name, cell_name, trials_left):
         OmegaConf.register_new_resolver(name.__name__, name, replace=True)
     OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
     # two runs that start in one second must not share a folder
@@ -39,8 +43,10 @@ def _refuse_environment(name: str, *_: str) -> None:
     raise SdfhubError(f"${{oc.env:{name}}}: settings are not taken from the environment; write the value")
 
 
-def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
+def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> None:
     """Composes `config_name` with the command line's overrides and runs `task` on it.
+
+    What a task returns is what a search lowers.
 
     A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
     line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
@@ -50,19 +56,22 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
         return
     failures: list[Exception] = []
     composed = False
-    verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    verbose, here = os.environ.get("HYDRA_FULL_ERROR") == "1", os.getpid()
     register_resolvers()
 
-    def guarded(config: DictConfig) -> None:
+    def guarded(config: DictConfig) -> float | None:
         nonlocal composed
         composed = True
         try:
             refuse_strangers(config, config_name)
-            task(config)
+            return task(config)
         except (SdfhubError, OmegaConfBaseException, OSError) as error:
             if verbose:
                 raise
+            if os.getpid() != here:  # a launcher's worker: only what is raised finds its way home
+                raise SdfhubError(one_line(error, config_name)) from None
             failures.append(error)
+        return None
 
     app = hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)(
         guarded
@@ -76,7 +85,8 @@ def run_task(task: Callable[[DictConfig], None], config_name: str) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
-        told = isinstance(error, HydraException | OmegaConfBaseException | OSError)
+        error = told_by_plugin(error) or error
+        told = isinstance(error, SdfhubError | HydraException | OmegaConfBaseException | OSError)
         if verbose or (composed and not told):  # what Hydra makes of a command line may raise anything
             raise
         failures.append(error)
@@ -102,6 +112,17 @@ def first_word_as(key: str) -> None:
         sys.argv[1] = f"{key}='{quoted}'"  # quoted, so that Hydra takes any path as text
 
 
+def told_by_plugin(error: Exception) -> SdfhubError | None:
+    """What a user needs of a failure of a launcher or a search; None where it is none of theirs."""
+    plugin = type(error).__module__.partition(".")[0]
+    if plugin in ("joblib", "submitit"):
+        reason = [type(error).__name__, *str(error).strip().splitlines()][-1]
+        return SdfhubError(f"{plugin}: a worker died: {reason}; the same command goes on from there")
+    if str(error).startswith(("No trials are completed", "Record does not exist")):  # Optuna's best of none
+        return SdfhubError("search: not one training came to its end; see failed.json in their folders")
+    return None
+
+
 def refuse_strangers(config: DictConfig, config_name: str) -> None:
     """Refuses top-level keys that nothing reads, such as `+sweep=...` written for `sweeps=...`.
 
@@ -120,6 +141,8 @@ def one_line(error: Exception, config_name: str = "config") -> str:
         return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
     text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
     text = text.split(" Config search path:")[0].split(" full_key:")[0].split(" See https://hydra.cc")[0]
+    if "hydra/sweeper/optuna'" in text:
+        return "search: needs Optuna; pip install 'sdfhub[optuna]'"
     unknown = re.match(r"Could not override '([^']+)'", text)
     missing = re.match(r"Missing mandatory value: (\S+)", text)
     if missing:

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
 
 WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
-WHERE_NOT_WHAT += ("data.loader.workers", "trainer.enable_", "trainer.log_every_n_steps")
+WHERE_NOT_WHAT += ("data.loader.workers", "search.", "trainer.enable_", "trainer.log_every_n_steps")
 WHERE_NOT_WHAT += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
 """Settings that say where and how watched a cell runs; its result is the same under any of them."""
 
@@ -32,7 +32,10 @@ def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
 
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
     """Folder name of a multirun: the sweep's own name, so that the same command finds its cells again."""
-    return _root_.hydra.runtime.choices.get("sweeps") or otherwise
+    choices = _root_.hydra.runtime.choices
+    if choices.get("search"):
+        return "_".join(["search", *(choices[name] for name in ("search", "data", "category", "scale"))])
+    return choices.get("sweeps") or otherwise
 
 
 def cell_name(*, _root_: DictConfig) -> str:

@@ -1,5 +1,6 @@
 """Task `prepare`: shapes of a source become samples in the store. Training calls the same on demand."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +9,7 @@ from omegaconf import DictConfig
 
 from sdfhub.data import store as stores
 from sdfhub.data.shards import StoredShape
+from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import Store
 from sdfhub.errors import SdfhubError
@@ -31,6 +33,13 @@ def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
         data: the plain `data` group.
         progress: show a bar.
     """
+    source, roles = source_and_split(data)
+    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
+    return prepare_split(source, roles, preparation, data, progress)
+
+
+def source_and_split(data: Mapping[str, Any]) -> tuple[Source, Split]:
+    """The source that a plain `data` group names, and its shapes by role."""
     shapes = check(data["shapes"], int | None, "data.shapes")
     held_out = check(data["held_out"], int, "data.held_out")
     if shapes is not None and shapes < 1:
@@ -38,14 +47,27 @@ def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
     if held_out < 0:
         raise SdfhubError(f"data.held_out={held_out}: must not be negative")
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    seed = check(data["split_seed"], int, "data.split_seed")
+    return source, split(source.shapes(), train=shapes, test=held_out, seed=seed)
+
+
+def prepare_part(data: Mapping[str, Any], part: str) -> None:
+    """Prepares every n-th of the shapes that the config's `data` group asks for; prints what came of it.
+
+    Args:
+        data: the plain `data` group.
+        part: `i/n`, the i-th of n parts, 1 <= i <= n.
+    """
+    numbers = re.fullmatch(r"(\d+)/(\d+)", part)
+    i, n = map(int, numbers.groups()) if numbers else (0, 0)
+    if not 1 <= i <= n:
+        raise SdfhubError(f"part={part}: must be i/n with 1 <= i <= n, such as part=1/4,2/4,3/4,4/4 with -m")
+    source, roles = source_and_split(data)
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    roles = split(
-        source.shapes(),
-        train=shapes,
-        test=held_out,
-        seed=check(data["split_seed"], int, "data.split_seed"),
-    )
-    return prepare_split(source, roles, preparation, data, progress)
+    own = (roles.train + roles.test)[i - 1 :: n]
+    workers = check(data["workers"], int | None, "data.workers")
+    made = stores.prepare_part(source, own, preparation, check(data["store"], str, "data.store"), workers)
+    print(f"part {part}: {_counted(len(own))}, {made} of them prepared now", flush=True)
 
 
 def prepare_split(
@@ -79,6 +101,10 @@ def main() -> None:
     """Console entry: `sdfhub prepare data=open category=chairs data.shapes=null`."""
 
     def task(config: DictConfig) -> None:
-        prepare_data(plain(config)["data"])
+        settings = plain(config)
+        if settings["part"] is None:
+            prepare_data(settings["data"])
+        else:
+            prepare_part(settings["data"], str(settings["part"]))
 
     run_task(task, "prepare")

@@ -81,9 +81,14 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
 def build_decoder(node: Mapping[str, Any]) -> Decoder:
     """The untrained decoder that a plain node `decoder` of a config describes.
 
-    Its classes are decoders, encodings and activations of this package, whatever the node names.
+    Its classes are decoders, encodings, activations and conditioned layers of this package, whatever the
+    node names.
     """
     given = {}
+    if "conditioning" in node:  # the decoder's own way is not written down
+        given["conditioning"] = build(
+            node["conditioning"] or {}, "decoder.conditioning", within="sdfhub.model.film"
+        )
     for part, within in (("encoding", "sdfhub.model.encodings"), ("activation", "sdfhub.model.activations")):
         given[part] = build(node.get(part) or {}, f"decoder.{part}", within=within)
     rest = {key: value for key, value in node.items() if key not in given}

@@ -1,6 +1,7 @@
 """A multirun from its first cell to its report: what is planned, what came of it, the exit status."""
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
+from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.cells import planned_cell
+
+EXTRAS = {"submitit": "slurm", "joblib": "joblib", "optuna": "optuna"}
+"""What to install of sdfhub for a launcher or sweeper, by the name of its plugin."""
 
 
 class SweepRecord(Callback):
@@ -24,7 +29,16 @@ class SweepRecord(Callback):
     def __init__(self) -> None:
         self._planned: list[PlannedCell] = []
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state
+        register_resolvers()  # a launcher's worker unpickles this before it reads a config
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        try:
+            refuse_missing_plugins(config)
+        except SdfhubError as error:
+            print(f"sdfhub: error: {error}", file=sys.stderr)
+            sys.exit(2)
         if not _is_training(config):
             return
         try:
@@ -49,6 +63,22 @@ class SweepRecord(Callback):
         if failed:
             print(f"sdfhub: error: {len(failed)} of {len(cells)} cells failed", file=sys.stderr)
             sys.exit(1)
+
+
+def refuse_missing_plugins(config: DictConfig) -> None:
+    """Refuses a launcher or sweeper whose package is not installed.
+
+    Raises:
+        SdfhubError: says what to install.
+    """
+    for role in ("launcher", "sweeper"):
+        package = ".".join(str(config.hydra[role]._target_).split(".")[:2])
+        name = next((name for name in EXTRAS if f"hydra_{name}_" in package), None)
+        if name and (find_spec("hydra_plugins") is None or find_spec(package) is None):
+            raise SdfhubError(
+                f"hydra/{role}={config.hydra.runtime.choices[f'hydra/{role}']}: is not installed here; "
+                f"pip install 'sdfhub[{EXTRAS[name]}]'"
+            )
 
 
 def planned_cells(config: DictConfig) -> list[PlannedCell]:

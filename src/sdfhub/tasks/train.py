@@ -36,6 +36,7 @@ from sdfhub.tasks.run import (
     read_weights,
     refuse_unwritable,
 )
+from sdfhub.tasks.search import objective
 
 FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
 FREE_TO_CHANGE += ("computing.", "data.workers", "data.loader.workers", "data.loader.resident")
@@ -209,13 +210,14 @@ def main() -> None:
     warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
-    def task(config: DictConfig) -> None:
+    def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
         if hydra.mode == RunMode.MULTIRUN:
-            run_cell(train, config, hydra)
-        elif name := hydra.runtime.choices.get("sweeps"):
-            raise SdfhubError(f"sweeps={name}: is a table of runs; add -m")
-        else:
-            go_on(train, plain(config), Path(hydra.runtime.output_dir))
+            return objective(run_cell(train, config, hydra))
+        for group in ("sweeps", "search"):
+            if name := hydra.runtime.choices.get(group):
+                raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
+        go_on(train, plain(config), Path(hydra.runtime.output_dir))
+        return None
 
     run_task(task, "config")

@@ -1,0 +1,39 @@
+"""What a search for settings asks of its trainings, and how many it may still run."""
+
+import os
+from statistics import fmean, median
+from typing import Any
+
+from sdfhub.report.results import ROLES, ShapeScore
+
+
+def objective(metrics: dict[str, Any]) -> float | None:
+    """What a search lowers: the median excess Chamfer distance, known and held-out shapes weighted alike.
+
+    Args:
+        metrics: what `metrics.json` of a run holds.
+
+    Returns:
+        Squared units of the normalised frame; None where nothing was judged, such as after a failure.
+    """
+    judged = [metrics[role]["shapes"] for role in ROLES if metrics.get(role, {}).get("shapes")]
+    medians = [median(ShapeScore.model_validate(row).excess for row in rows) for rows in judged]
+    return fmean(medians) if medians else None
+
+
+def trials_left(total: int, storage: str, study: str) -> int:
+    """How many of a search's trainings are still to come: the same command goes on, it does not begin again.
+
+    Args:
+        total: trainings of the whole search.
+        storage: URL of the study's database.
+        study: its name there.
+    """
+    os.environ.setdefault("SQLALCHEMY_SILENCE_UBER_WARNING", "1")  # of a version that the plugin is bound to
+    import optuna  # an extra, and slow to import
+
+    try:
+        trials = optuna.load_study(study_name=study, storage=storage).trials
+    except KeyError:  # no such study yet
+        return total
+    return max(0, total - sum(trial.state.is_finished() for trial in trials))

@@ -1,0 +1,145 @@
+"""A search is a sweep that chooses its cells as it goes, within a budget that a restart does not renew."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sdfhub.errors import SdfhubError
+from sdfhub.report.results import read_sweep
+from sdfhub.tasks import train as train_task
+from sdfhub.tasks.app import one_line, told_by_plugin
+from sdfhub.tasks.names import settings_digest
+from sdfhub.tasks.search import objective
+from tests.sweep_folders import score
+from tests.test_config import CONF, composed
+
+pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
+SEARCHES = sorted(path.stem for path in (CONF / "search").glob("*.yaml"))
+
+
+def space(search: str) -> dict[str, str]:
+    node, chain = {}, [search]
+    while chain[-1] != "deepsdf":
+        chain.append(yaml.safe_load((CONF / "search" / f"{chain[-1]}.yaml").read_text())["defaults"][0])
+    for name in reversed(chain):
+        node |= yaml.safe_load((CONF / "search" / f"{name}.yaml").read_text())["hydra"]["sweeper"]["params"]
+    return node
+
+
+@pytest.mark.parametrize("search", SEARCHES)
+def test_every_setting_that_is_searched_is_one_of_its_row(search):
+    params = space(search)
+    assert params.pop("experiment") == search
+    config = composed(f"experiment={search}")
+    for key in params:
+        node = config
+        for part in key.split("."):
+            node = node[part]
+        assert isinstance(node, float | int), key
+
+
+def test_every_row_has_the_same_budget():
+    assert {composed(f"search={search}")["search"]["trials"] for search in SEARCHES} == {24}
+    rates = [
+        {key: space(search)[key] for key in ("optim.lr_decoder", "optim.lr_codes")} for search in SEARCHES
+    ]
+    assert all(rate == rates[0] for rate in rates)
+
+
+class Trainer:
+    """Stands in for training: the excess grows with the distance of the learning rate from 1e-3."""
+
+    def __init__(self):
+        self.rates, self.fail_after, self.kill_after = [], 1000, 1000
+
+    def __call__(self, config: dict, run: Path) -> dict:
+        self.rates.append(config["optim"]["lr_decoder"])
+        if len(self.rates) > self.kill_after:
+            raise KeyboardInterrupt
+        if len(self.rates) > self.fail_after:
+            raise SdfhubError("the loss is not finite at step 7")
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        (run / "split.json").write_text(json.dumps({"train": ["a"], "held_out": []}))
+        metrics = {"training": {"seconds": 1.0, "steps": 5, "parameters": 9}}
+        metrics["known"] = {"summary": {}, "shapes": [score("a", 1e-3 + abs(self.rates[-1] - 1e-3))]}
+        (run / "metrics.json").write_text(json.dumps(metrics))
+        return metrics
+
+
+@pytest.fixture
+def search(monkeypatch, tmp_path):
+    """`train.py -m search=fft_hosc` in this process, without training."""
+    stand_in = Trainer()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_task, "train", stand_in)
+
+    def start(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["train.py", "-m", "search=fft_hosc", "scale=demo", *words])
+        try:
+            train_task.main()
+        except SystemExit as stop:
+            return stop.code
+        return 0
+
+    stand_in.start, stand_in.folder = (
+        start,
+        tmp_path / "outputs/sweeps/search_fft_hosc_procedural_chairs_demo",
+    )
+    return stand_in
+
+
+def test_an_interrupted_search_goes_on_to_its_budget_and_not_beyond(search):
+    search.kill_after = 2
+    assert search.start("search.trials=4") == 130
+    assert len(search.rates) == 3
+    search.kill_after = 1000
+    assert search.start("search.trials=4") == 0
+    assert len(search.rates) == 5, "two more trials: the interrupted one has no value"
+    assert search.start("search.trials=4") == 0
+    assert len(search.rates) == 5, "the budget is spent"
+    found = yaml.safe_load((search.folder / "optimization_results.yaml").read_text())
+    finished = [rate for index, rate in enumerate(search.rates) if index != 2]
+    assert found["best_params"]["optim.lr_decoder"] == min(finished, key=lambda rate: abs(rate - 1e-3))
+    cells = read_sweep(search.folder)
+    assert [cell.state for cell in cells].count("done") == 4
+    assert {cell.plan.choices["experiment"] for cell in cells} == {"fft_hosc"}
+    assert (search.folder / "report" / "report.html").is_file()
+
+
+def test_a_training_that_fails_is_an_answer_and_a_search_of_failures_says_so(search, capsys):
+    search.fail_after = 1
+    assert search.start("search.trials=2") == 1, "as any sweep with a failed cell"
+    assert [cell.state for cell in read_sweep(search.folder)] == ["done", "failed"]
+    assert (search.folder / "optimization_results.yaml").is_file()
+    search.fail_after, search.rates = 0, []
+    assert search.start("search.trials=2", "category=lamps") == 2
+    told = capsys.readouterr().err
+    assert "not one training came to its end" in told and "Traceback" not in told
+
+
+def test_the_objective_weighs_roles_alike_and_counts_shapes_without_a_surface():
+    known = {"shapes": [score("a", 1e-3), score("b", 3e-3), score("c", 2e-3)]}
+    held_out = {"shapes": [score("d", None, penalty=0.4)]}
+    floor = 0.05e-3
+    assert objective({"known": known}) == pytest.approx(2e-3 - floor)
+    assert objective({"known": known, "held_out": held_out}) == pytest.approx((2e-3 + 0.4) / 2 - floor)
+    assert objective({}) is None and objective({"known": {"shapes": []}}) is None
+
+
+def test_the_budget_is_no_setting_of_a_training():
+    one, other = (composed("search=siren", f"search.trials={trials}") for trials in (4, 5))
+    assert settings_digest(one) == settings_digest(other)
+
+
+def test_a_search_without_optuna_or_multirun_says_what_is_missing(monkeypatch, capsys, tmp_path):
+    missing = ValueError("In 'search/siren': Could not find 'hydra/sweeper/optuna'\nAvailable options")
+    assert "pip install 'sdfhub[optuna]'" in one_line(missing)
+    assert told_by_plugin(ValueError("another")) is None
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", "search=siren"])
+    with pytest.raises(SystemExit):
+        train_task.main()
+    assert "search=siren: is a table of runs; add -m" in capsys.readouterr().err
