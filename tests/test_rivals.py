@@ -14,7 +14,7 @@ from tests.test_model import ACTIVATIONS, small_decoder
 
 
 def test_finers_frequency_grows_from_omega_to_2k_plus_1_times_omega():
-    """Liu et al. 2024, section 3.2: sin(omega (|x| + 1) x) runs locally at omega (2 |x| + 1)."""
+    """Liu et al. 2024: sin(omega (|x| + 1) x) runs locally at omega (2 |x| + 1)."""
     omega, k = 40.0, 3.0
     crossing = torch.arange(1, 160) * torch.pi / omega  # where the phase passes a multiple of pi
     zeros = (torch.sqrt(1 + 4 * crossing) - 1) / 2
@@ -39,7 +39,7 @@ def spread_of_frequencies(activation) -> float:
 
 
 def test_finers_biases_choose_its_frequencies_and_sirens_do_not():
-    """Liu et al. 2024, section 3.3: biases from U(-k, k) select sub-functions of higher frequency."""
+    """Liu et al. 2024: biases from U(-k, k) select sub-functions of higher frequency."""
     narrow, wide = (spread_of_frequencies(Finer(60.0, 60.0, k, first=True)) for k in (0.1, 4.0))
     assert wide > 2 * narrow
     assert spread_of_frequencies(Siren(60.0, 60.0, first=True)) < 1.5 * narrow
@@ -54,7 +54,7 @@ def test_finers_biases_start_as_its_authors_say():
 
 
 def test_a_narrow_gaussian_has_features_of_high_rank_and_steep_slopes():
-    """Ramasinghe and Lucey 2022, section 3: stable rank and Lipschitz constant both grow as 1 / a."""
+    """Ramasinghe and Lucey 2022: stable rank and Lipschitz constant both grow as 1 / a."""
 
     def stable_rank(a: float) -> float:
         points = torch.linspace(-1, 1, 256)[:, None]
@@ -72,7 +72,7 @@ def test_a_narrow_gaussian_has_features_of_high_rank_and_steep_slopes():
 
 
 def test_wire_is_compact_in_space_and_in_frequency():
-    """Saragadam et al. 2023, section 3: the spectrum of a Gabor wavelet is a Gaussian about its frequency."""
+    """Saragadam et al. 2023: the spectrum of a Gabor wavelet is a Gaussian about its frequency."""
     omega, s, step = 12.0, 2.0, 0.01
     x = torch.arange(-1000, 1000, dtype=torch.double) * step
     wave = Wire(omega, omega, s)(x)

@@ -174,7 +174,7 @@ class Finer(Activation):
     code holds |x| + 1 fixed while it differentiates; here it is differentiated, because a normal is the
     field's own slope.
 
-    Source: Liu et al. 2024, equations 6 and 7 (FINER).
+    Source: Liu et al. 2024 (FINER), and its published code for the first biases.
 
     Args:
         omega_0: frequency factor of the first layer at x = 0, > 0.
@@ -210,7 +210,7 @@ class Finer(Activation):
 class Gauss(Activation):
     """exp(-x^2 / (2 a^2)), initialised as PyTorch's linear layers are.
 
-    Source: Ramasinghe and Lucey 2022, table 1; they draw weights by several laws and find that it matters
+    Source: Ramasinghe and Lucey 2022; they draw weights by several laws and find that it matters
     little for this activation.
 
     Args:
@@ -242,7 +242,7 @@ class Wire(Activation):
     The real layer in the authors' code has weights of its own for the bump; here wave and bump share one
     linear map, as they do in the complex layer.
 
-    Source: Saragadam et al. 2023, equation 5 (WIRE), and its published code.
+    Source: Saragadam et al. 2023 (WIRE), and its published code.
 
     Args:
         omega_0: frequency of the first layer's wave, > 0.

@@ -12,7 +12,7 @@ class Film(Layer):
     s and t are one linear map of the code, a layer's own; pi-GAN has a mapping network before it, which a
     table of free codes needs less than a generator's noise does.
 
-    Source: Perez et al. 2018 (FiLM); Chan et al. 2021, equation 4 (pi-GAN) for sines.
+    Source: Perez et al. 2018 (FiLM); Chan et al. 2021 (pi-GAN) for sines.
 
     Args:
         hidden, encoding: number of input columns of each part; 0 leaves the part out.
