@@ -95,6 +95,11 @@ def test_a_limit_of_steps_that_is_none_is_named(value, tmp_path):
         start(config, tmp_path)
 
 
+def test_a_class_that_takes_no_settings_is_refused(tmp_path):
+    with pytest.raises(SdfhubError, match=r"data\.loader\._target_"):
+        start(with_value("data.loader._target_", "sdfhub.errors.SdfhubError"), tmp_path)
+
+
 def test_a_misspelt_command_leaves_no_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0"])

@@ -92,6 +92,7 @@ def _locate(path: Any, key: str, within: str) -> type:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise SdfhubError(f"{key}._target_: there is no {path}") from error
-    if not inspect.isclass(found) or not f"{found.__module__}.".startswith(within + "."):
+    is_ours = inspect.isclass(found) and f"{found.__module__}.".startswith(within + ".")
+    if not is_ours or issubclass(found, BaseException):  # a mistake has no settings
         raise SdfhubError(f"{key}._target_: {path!r} is not a class of {within}")
     return found
