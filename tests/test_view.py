@@ -21,9 +21,10 @@ import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.space import reconstruct
 from sdfhub.tasks import view as view_task
+from sdfhub.tasks.dropped_scan import fit_scan
 from sdfhub.tasks.live_meshing import LiveMesher, Meshed
 from sdfhub.tasks.loopback import MAX_UPLOAD, PART, Gate, refusal
-from sdfhub.tasks.viewer import MEAN, Viewer, fit_scan, told
+from sdfhub.tasks.viewer import MEAN, Viewer, told
 from tests.ball_space import IDS, RADII, write_ball_run
 
 
@@ -211,7 +212,7 @@ def test_a_fit_is_that_of_the_meshs_own_signed_distances(space):
 BROKEN = {
     "a.exe": (b"MZ", "not a mesh format"),
     "a.ply": (b"ply\nnothing", "cannot be read as ply"),
-    "b.ply": (b"", "empty, or larger than 64 MiB"),
+    "b.ply": (b"", "empty, larger than 64 MiB"),
     "c.obj": (b"v 0 0 nan\n", "nan"),
     "d.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "d.off"),
     "e.gltf": (b'{"asset":{"version":"2.0"},"buffers":[{"uri":"/etc/passwd","byteLength":9}]}', "e.gltf"),

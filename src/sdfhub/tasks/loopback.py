@@ -9,6 +9,7 @@ messages only those pass that the page needs.
 import contextlib
 import http
 import io
+import logging
 import math
 import socket
 from collections.abc import Collection
@@ -31,6 +32,9 @@ MAX_UPLOAD = 64 << 20
 
 PART = 512 << 10
 """Bytes of the parts in which viser's page sends a file."""
+
+_QUIET = logging.getLogger(__name__)
+_QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, and none for a traceback
 
 
 class LoopbackServer(viser.ViserServer):
@@ -103,7 +107,7 @@ class _Serve(sockets.serve):
                 response.headers["Content-Security-Policy"] = policy(request.headers.get("Host", HOST))
             return response
 
-        options |= {"create_connection": partial(_Gated, suffixes), "max_size": 2 * PART}
+        options |= {"create_connection": partial(_Gated, suffixes), "max_size": 2 * PART, "logger": _QUIET}
         super().__init__(*arguments, process_request=answer, **options)
 
 
@@ -135,7 +139,7 @@ class Gate:
         if self._missing or not is_known or not 0 < size <= MAX_UPLOAD or parts != math.ceil(size / PART):
             return message | {"size_bytes": 0, "part_count": 0}
         self._uploading, self._missing = message["transfer_uuid"], set(range(parts))
-        return message
+        return message | {"size_bytes": size, "part_count": parts}
 
     def _is_missing(self, message: dict[str, Any]) -> bool:
         index, content = message["part_index"], message["content"]

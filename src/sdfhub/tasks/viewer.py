@@ -12,11 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdfhub.data.mesh import FORMATS, triangles_of
-from sdfhub.data.preparation import Preparation
-from sdfhub.data.sampling import prepare_mesh
 from sdfhub.errors import SdfhubError
 from sdfhub.space import Space
+from sdfhub.tasks.dropped_scan import FORMATS, fit_scan
 from sdfhub.tasks.live_meshing import LiveMesher, Meshed
 from sdfhub.tasks.loopback import MAX_UPLOAD, LoopbackServer
 
@@ -89,6 +87,8 @@ class Viewer:
         if not self._fitting.acquire(blocking=False):
             return self._say("One scan at a time: another is being fitted.")
         try:
+            if not content:  # what the gate cut off arrives so
+                raise SdfhubError(f"{name}: empty, larger than {MAX_UPLOAD >> 20} MiB or of another type")
             self._say(f"Fitting {name} …")
             code, surface = fit_scan(self.space, name, content)
             with torch.no_grad():
@@ -198,25 +198,3 @@ def shown_name(name: str) -> str:
 def told(text: str, kind: str) -> str:
     """A paragraph of plain text for the page."""
     return f'<p class="sdfhub-{kind}">{html.escape(text)}</p>'
-
-
-def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
-    """The code [L] of the shape in a mesh file, and points [M, 3] of its surface, normalised frame.
-
-    Raises:
-        SdfhubError: names the file and what is wrong with it.
-    """
-    suffix = PurePath(name).suffix.lower()
-    if suffix not in FORMATS:
-        raise SdfhubError(f"{name}: not a mesh format known here ({' '.join(FORMATS)})")
-    if not content:
-        raise SdfhubError(f"{name}: empty, or larger than {MAX_UPLOAD >> 20} MiB; decimate the mesh first")
-    how = Preparation(samples=100_000, surface_points=4000)
-    try:
-        prepared = prepare_mesh(triangles_of(content, suffix, name), how)
-    except SdfhubError as error:
-        raise SdfhubError(str(error) if name in str(error) else f"{name}: {error}") from error
-    inside = prepared.sdf < 0
-    each = min(inside.sum(), (~inside).sum(), space.how_to_fit.samples // 2)
-    rows = np.concatenate([np.flatnonzero(side)[:each] for side in (inside, ~inside)])
-    return space.fit(points=prepared.points[rows], sdf=prepared.sdf[rows]), prepared.surface_points
