@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 import sdfhub
+from sdfhub.data.scan import read_scan
 from sdfhub.errors import SdfhubError
 from sdfhub.space import reconstruct
 from sdfhub.tasks import view as view_task
@@ -193,19 +194,30 @@ def test_a_mesh_is_fitted_offered_and_shown_with_its_points(viewer, space):
     wait_until(lambda: not viewer.scan.visible)
 
 
-def test_a_fit_is_that_of_the_meshs_own_signed_distances(space):
-    code, surface = fit_scan(space, "ball.obj", ball_file(kind="obj"))
-    assert surface.shape == (4000, 3)
-    largest = space.sdf(surface, IDS[3]).abs().mean()  # the normalised ball is larger than all of the space
-    assert space.sdf(surface, code).abs().mean() < largest
+def cloud_file() -> bytes:
+    points = trimesh.creation.icosphere(subdivisions=4, radius=3.0).vertices + [5.0, 0, 0]
+    return "\n".join(" ".join(map(str, point)) for point in points).encode()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("ball.obj", ball_file(kind="obj")), ("ball.xyz", cloud_file())]
+)
+def test_a_mesh_or_cloud_is_fitted_as_the_space_fits_it_in_its_own_frame(space, name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    code, surface = fit_scan(space, name, content)
+    torch.testing.assert_close(code, space.fit_scan(read_scan(tmp_path / name), "shape"))
+    assert len(surface) <= 4000 and surface.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(surface, axis=1), 1 / 1.03, atol=0.01)
 
 
 BROKEN = {
-    "a.exe": (b"MZ", "not a mesh format"),
-    "a.ply": (b"ply\nnothing", "cannot be read as ply"),
+    "a.exe": (b"MZ", "not a format"),
+    "a.ply": (b"ply\nnothing", "not a PLY file"),
     "b.ply": (b"", "empty, larger than 64 MiB"),
     "c.obj": (b"v 0 0 nan\n", "nan"),
     "d.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "d.off"),
+    "f.xyz": (b"1 2 3\n" * 9, "f.xyz: holds 9 points"),
+    "g.npy": (b"\x93NUMPY", "g.npy"),
     "e.gltf": (b'{"asset":{"version":"2.0"},"buffers":[{"uri":"/etc/passwd","byteLength":9}]}', "e.gltf"),
 }
 

@@ -82,7 +82,7 @@ def test_a_slider_changes_the_mesh_in_the_page(opened, viewer):
 def test_a_dropped_file_is_fitted_and_shown(opened, tmp_path):
     file = tmp_path / "scan of a ball.ply"
     file.write_bytes(ball_file())
-    box = opened.get_by_text("Drop a mesh here").bounding_box()
+    box = opened.get_by_text("Drop a scan here").bounding_box()
     devtools = opened.context.new_cdp_session(opened)
     what = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
     place = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}

@@ -162,8 +162,8 @@ class Viewer:
             self.sliders = [gui.add_slider(f"{axis}", -REACH, REACH, 0.05, 0.0, hint=hint) for axis in axes]
             reset = gui.add_button("Back to A", color="gray")
         with gui.add_folder("Fit a scan"):
-            upload = gui.add_upload_button("Drop a mesh here, or click", mime_type=",".join(FORMATS))
-            what = f"{' '.join(FORMATS)}, at most {MAX_UPLOAD >> 20} MiB"
+            upload = gui.add_upload_button("Drop a scan here, or click", mime_type=",".join(FORMATS))
+            what = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
             self.message = gui.add_html(told(what, "small"))
             self.overlay = gui.add_checkbox("Show the scan's points", True, visible=False)
         self.a.on_update(lambda _: self.reset())
