@@ -153,6 +153,15 @@ def test_the_page_shows_a_shape_goes_to_another_and_comes_back(viewer):
     assert [slider.value for slider in (viewer.share, *viewer.sliders)] == [0.0] * (1 + len(viewer.sliders))
 
 
+def test_the_page_refines_what_rests(space):
+    viewer = Viewer(space, "balls", 0, 96)
+    try:
+        assert viewer.mesher.resolutions == (64, 96)
+        wait_until(lambda: "96³" in viewer.name.content)
+    finally:
+        viewer.close()
+
+
 def test_a_slider_moves_by_standard_deviations_along_a_principal_axis(viewer, space):
     asked = []
     viewer.a.value = IDS[1]

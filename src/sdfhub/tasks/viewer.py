@@ -21,8 +21,8 @@ from sdfhub.tasks.loopback import MAX_UPLOAD, LoopbackServer
 DIRECTIONS, REACH = 6, 3.0
 """Sliders along principal directions, and how far they go, in standard deviations."""
 
-MOVING = 64
-"""Points along an axis of the grid while something moves."""
+RUNGS = (64, 128)
+"""Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
 
 MEAN = "(mean of all shapes)"
 EYE_AND_AIM = [[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]]
@@ -54,7 +54,7 @@ class Viewer:
         self.server = LoopbackServer(port, "sdfhub", FORMATS)
         self._furnish()
         self._add_controls(title)
-        rungs = [MOVING, resolution] if resolution > MOVING else [resolution]
+        rungs = [*(rung for rung in RUNGS if rung < resolution), resolution]
         self.mesher = LiveMesher(space.decoder, rungs, self._draw)
         self.refresh()
 
