@@ -97,7 +97,7 @@ def imported_at_start(module: str) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("slow", ["trimesh", "tensorboard", "jinja2", "playwright"])
+@pytest.mark.parametrize("slow", ["trimesh", "tensorboard", "jinja2", "playwright", "viser"])
 def test_a_training_starts_without(slow):
     """Hydra imports the callback of sweeps whenever it starts."""
     found = imported_at_start("sdfhub.tasks.train") | imported_at_start("sdfhub.tasks.sweep")

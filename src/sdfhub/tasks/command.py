@@ -12,6 +12,7 @@ TASKS = {
     "interpolate": "shapes between two: sdfhub interpolate run=RUN a=ID b=ID steps=8",
     "sample": "new shapes of a space: sdfhub sample run=RUN n=8",
     "neighbours": "the shapes most like one: sdfhub neighbours run=RUN of=ID",
+    "view": "a page on this machine to see, move, mix and fit shapes: sdfhub view run=RUN",
     "import-deepsdf": "an experiment of DeepSDF's code becomes a run: sdfhub import-deepsdf EXPERIMENT_DIR",
     "reconstruct": "finds the shapes behind scans: sdfhub reconstruct run=RUN target=scan.ply",
     "report": "tables, claims and a page from a sweep's folder: sdfhub report outputs/sweeps/table_small",

@@ -1,0 +1,40 @@
+"""How soon a shape of a run appears in `sdfhub view`: from what a control says to its mesh.
+
+    python benchmarks/viewing.py outputs/.../RUN [shapes]
+
+Prints a Markdown table of milliseconds at the resolutions that the page goes through, medians over shapes.
+Transfer to the browser (loopback) and drawing come on top.
+"""
+
+import queue
+import statistics
+import sys
+
+import sdfhub
+from sdfhub.tasks.live_meshing import LiveMesher, Meshed
+
+RESOLUTIONS = (64, 128, 192, 256)
+
+
+def milliseconds(space: sdfhub.Space, resolution: int, shapes: int) -> float:
+    """The median time until the mesh of a shape, compilers warmed up by one before."""
+    shown: queue.Queue[Meshed] = queue.Queue()
+    mesher = LiveMesher(space.decoder, [resolution], shown.put)
+    found = []
+    for row in range(shapes + 1):
+        mesher.ask(space.code(row % len(space.ids)))
+        found.append(shown.get().seconds)
+    mesher.close()
+    return 1e3 * statistics.median(found[1:])
+
+
+def main(run: str, shapes: int = 8) -> None:
+    space = sdfhub.load(run)
+    weights = sum(weight.numel() for weight in space.decoder.parameters())
+    print(f"{run}: {weights:,} weights, on {space.device}\n\n| grid | ms |\n| --- | --- |")
+    for resolution in RESOLUTIONS:
+        print(f"| {resolution}^3 | {milliseconds(space, resolution, shapes):.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], *map(int, sys.argv[2:]))

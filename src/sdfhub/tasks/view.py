@@ -1,0 +1,40 @@
+"""Task `view`: a page on this machine on which a space's shapes can be turned, moved, mixed and fitted."""
+
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Ge, Le
+from omegaconf import DictConfig
+
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks.app import run_task
+from sdfhub.tasks.build import check, plain
+from sdfhub.tasks.opening import load
+
+
+def view(config: dict[str, Any]) -> None:
+    """The task: `config` as conf/view.yaml has it. Returns when the process is interrupted."""
+    run = check(config["run"], str, "run")
+    port = check(config["port"], Annotated[int, Ge(0), Le(65535)], "port")
+    resolution = check(config["resolution"], Annotated[int, Ge(8), Le(512)], "resolution")
+    try:
+        from sdfhub.tasks.viewer import Viewer
+    except ImportError as error:
+        raise SdfhubError("view: needs more packages: pip install 'sdfhub[view]'") from error
+    viewer = Viewer(load(run), Path(run).resolve().name, port, resolution)
+    try:
+        viewer.drawn.wait()  # the first mesh waits for compilers
+        print(f"http://127.0.0.1:{viewer.server.get_port()} shows {run}; Ctrl-C ends it", flush=True)
+        threading.Event().wait()
+    finally:
+        viewer.close()
+
+
+def main() -> None:
+    """Console entry: `sdfhub view run=RUN`."""
+
+    def task(config: DictConfig) -> None:
+        view(plain(config))
+
+    run_task(task, "view")
