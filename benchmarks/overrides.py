@@ -21,6 +21,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+import yaml
 from hydra import compose, initialize_config_dir
 from lightning.pytorch import Trainer
 
@@ -81,10 +82,12 @@ def started(*_, **__):
 def keys_and_groups() -> tuple[list[str], dict[str, list[str]]]:
     """Every leaf of the composed config with all choices of every group, and the groups' choices."""
     folder = configuration_folder()
+    defaults = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["defaults"]
+    own = [group for entry in defaults if isinstance(entry, dict) for group in entry if "/" not in group]
     groups = {
-        group.name: sorted(path.stem for path in group.glob("*.yaml"))
-        for group in folder.iterdir()
-        if group.is_dir() and group.name not in ("sweeps",)
+        group: sorted(path.stem for path in (folder / group).glob("*.yaml"))
+        for group in own
+        if group not in ("sweeps", "search")
     }
     keys: dict[str, None] = {}
     with initialize_config_dir(str(folder), version_base="1.3"):

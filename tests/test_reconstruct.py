@@ -114,8 +114,13 @@ def test_without_the_runs_data_there_are_meshes_but_no_verdicts(run, scans, tmp_
 
 def test_a_threshold_lies_above_what_it_was_measured_on():
     residuals = np.exp(np.random.default_rng(0).normal(-6, 0.3, 200))
-    threshold = Calibration(shapes=200, spread=2.5).threshold(residuals)
+    threshold = Calibration(shapes=200, spread=2.5, reach=1.5).threshold(residuals)
     assert (residuals <= threshold).mean() > 0.98 and threshold < 2 * np.exp(-6 + 2.5 * 0.3)
+
+
+def test_a_threshold_stays_near_the_worst_however_far_residuals_spread():
+    residuals = np.array([0.001, 0.002, 0.02])
+    assert Calibration(shapes=3, spread=2.5, reach=1.5).threshold(residuals) == pytest.approx(0.03)
 
 
 def test_scans_are_judged_by_scans_like_them():

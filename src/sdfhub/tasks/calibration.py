@@ -39,19 +39,22 @@ class Calibration:
     Args:
         shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
         spread: standard deviations that the logarithm of a residual may lie above the mean of theirs, > 0.
+        reach: times the largest of theirs, beyond which no residual is trusted however far theirs spread, > 0.
     """
 
     shapes: int
     spread: float
+    reach: float
 
     def __post_init__(self):
-        if (self.shapes < 3 and self.shapes != 0) or self.spread <= 0:
-            raise ValueError("shapes must be at least 3, or 0 for no verdicts, and spread positive")
+        if (self.shapes < 3 and self.shapes != 0) or min(self.spread, self.reach) <= 0:
+            raise ValueError("shapes must be at least 3, or 0 for no verdicts; spread and reach positive")
 
     def threshold(self, residuals: np.ndarray) -> float:
         """The residual above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
         logarithms = np.log(np.maximum(residuals, 1e-12))
-        return float(np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1)))
+        usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
+        return float(min(usual, self.reach * np.max(residuals)))
 
 
 @dataclass(frozen=True)
