@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEV_STAMP := $(VENV)/.installed-dev
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint data bench clean
@@ -10,22 +11,26 @@ STAMP := $(VENV)/.installed
 help: ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
 
-install: $(STAMP) ## make .venv and install into it what constraints.txt pins
+install: $(STAMP) ## make .venv and install into it what constraints.txt pins; extras are not among it
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "sdfhub needs Python 3.11 or newer; say which: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	@touch $@
+
+$(DEV_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
 demo: install ## train HOSC + Fourier + normals on procedural chairs and print the Chamfer table (minutes)
 	$(BIN)/python train.py activation=hosc encoding=fourier scale=demo
 
-test: install ## run the tests
+test: $(DEV_STAMP) ## run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-lint: install ## check style
+lint: $(DEV_STAMP) ## check style
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 

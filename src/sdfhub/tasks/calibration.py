@@ -39,7 +39,7 @@ class Calibration:
     Args:
         shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
         spread: standard deviations that the logarithm of a residual may lie above the mean of theirs, > 0.
-        reach: times the largest of theirs, beyond which no residual is trusted however far theirs spread, > 0.
+        reach: times the largest of theirs, however far theirs spread, > 0.
     """
 
     shapes: int
