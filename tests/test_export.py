@@ -131,6 +131,12 @@ def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch,
     printed = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={IDS[0]}", "k=2", "resolution=12")
     assert printed.splitlines()[0].split()[0] == sdfhub.load(run).neighbours(IDS[0], 1)[0][0]
     assert (run / "neighbours" / "balls-small" / "strip.png").is_file()
+    scan = run / "scan.xyz"
+    away = np.random.default_rng(0).normal(size=(2000, 3))
+    np.savetxt(scan, 7 + 3 * away / np.linalg.norm(away, axis=1, keepdims=True))
+    printed = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={scan}", "k=1", "resolution=12")
+    assert printed.splitlines()[0].split()[0] in IDS
+    assert (run / "neighbours" / "scan.xyz" / "strip.png").is_file()
 
 
 MISTAKES = [

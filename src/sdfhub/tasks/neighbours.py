@@ -1,9 +1,11 @@
-"""Task `neighbours`: the known shapes whose codes are nearest to one's."""
+"""Task `neighbours`: the known shapes whose codes are nearest to that of one of them, or of a scan."""
 
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
+from sdfhub.data.scan import read_scan
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery
@@ -16,12 +18,15 @@ def neighbours(config: dict[str, Any]) -> None:
     out = check(config["out"], str | None, "out")
     resolution = check(config["resolution"], int, "resolution")
     space = load(run)
+    if Path(str(shape)).is_file():
+        of, shape = Path(str(shape)).name, space.fit_scan(read_scan(Path(str(shape))), "shape")
+    else:
+        of = space.ids[space.row(shape)]
     found = space.neighbours(shape, check(config["k"], int, "k"))
-    of = space.ids[space.row(shape)]
     for id, distance in found:
         print(f"{id:<40} {distance:.4f}")
     captions = [f"of {of}", *(f"{id}\n{distance:.3f}" for id, distance in found)]
-    codes = space.code([of, *(id for id, _ in found)])
+    codes = space.code([shape, *(id for id, _ in found)])
     write_gallery(space, codes, captions, beside(run, out, f"neighbours/{of.replace('/', '-')}"), resolution)
 
 
