@@ -32,7 +32,7 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import ShapeSamples
 from sdfhub.whole_file import write_whole
 
-COMPARED = ".compared.json"
+COMPARED = "compared.json"
 """Beside the manifest: sizes and dates of files whose checksums were right. Without it all are compared."""
 
 PASSING = ("error", "crash")
@@ -240,6 +240,8 @@ def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> di
             enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
     finally:  # a run that is interrupted keeps what it has
         write_manifest(folder, manifest)
+    kept = {shape.id: manifest["shapes"].get(shape.id) for shape in shapes}
+    _remember(folder, {id: _state(folder / id, record) for id, record in kept.items() if record})
     return manifest
 
 
@@ -286,10 +288,14 @@ def _damaged(shapes: list[Shape], manifest: dict, folder: Path) -> list[str]:
         files = ", ".join(f"{name}.npy" for name in wrong)
         print(f"store: {folder / id}: {files} damaged (checksum): prepared again", flush=True)
     if fresh:
-        compared |= {id: states[id] for id in fresh if id not in names}
-        with suppress(OSError):  # a store that others own is read all the same
-            write_whole(folder / COMPARED, json.dumps(compared))
+        _remember(folder, {id: states[id] for id in fresh if id not in names})
     return list(names)
+
+
+def _remember(folder: Path, states: dict[str, str | None]) -> None:
+    """Notes states of shapes whose checksums are right."""
+    with suppress(OSError):  # a store that others own is read all the same
+        write_whole(folder / COMPARED, json.dumps(_compared(folder) | states))
 
 
 def _compared(folder: Path) -> dict[str, str]:
