@@ -76,7 +76,7 @@ def test_preparation_killed_again_and_again_ends_with_the_same_store(processes, 
             break  # starting an interpreter is slow
     time.sleep(0.3 * (processes - 1))  # workers end a moment after the process that they work for
     fill(root, source)
-    for leftover in folder.glob("*/.*"):
+    for leftover in [*folder.glob(".*"), *folder.glob("*/.*")]:
         os.utime(leftover, (1, 1))  # as if an hour had passed
     (folder / MANIFEST).unlink()  # any run that has something to do clears up
     fill(root, source)

@@ -68,11 +68,14 @@ def write_shape(folder: Path, arrays: Mapping[str, np.ndarray], record: dict) ->
 
 
 def remove_leftovers(store: Path) -> None:
-    """Removes the half-written shapes of runs that were killed more than an hour ago."""
-    for leftover in store.glob("*/.*"):
+    """Removes the half-written shapes and files of runs that were killed more than an hour ago."""
+    for leftover in [*store.glob(".*"), *store.glob("*/.*")]:
         is_ours = _LEFTOVER.fullmatch(leftover.name) and not leftover.parent.is_symlink()
         if is_ours and time.time() - leftover.lstat().st_mtime > 3600:
-            shutil.rmtree(leftover, ignore_errors=True)
+            if leftover.is_dir() and not leftover.is_symlink():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
 
 
 def read_record(folder: Path) -> dict | None:
