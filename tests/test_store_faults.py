@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from sdfhub.data import shards, store
+from sdfhub.data.comparison import COMPARED
 from sdfhub.data.manifest import MANIFEST, read_manifest
 from sdfhub.data.store import Store
 from sdfhub.errors import SdfhubError
@@ -41,7 +42,7 @@ def everything(folder: Path) -> dict[str, object]:
     """All files of a store; of its records all but the seconds that each shape took."""
     found: dict[str, object] = {}
     for path in folder.rglob("*"):
-        if path.is_file() and path.name not in (".lock", store.COMPARED):
+        if path.is_file() and path.name not in (".lock", COMPARED):
             name = str(path.relative_to(folder))
             found[name] = (
                 timeless(json.loads(path.read_text())) if path.suffix == ".json" else path.read_bytes()
@@ -262,6 +263,6 @@ def test_files_are_compared_again_only_when_their_date_or_size_has_changed(tmp_p
     os.utime(folder / "balls/0001/inside.npy", (1, 1))
     fill(tmp_path, Balls(3))
     assert compared == ["0001"]
-    (folder / store.COMPARED).unlink()
+    (folder / COMPARED).unlink()
     fill(tmp_path, Balls(3))
     assert sorted(compared) == ["0000", "0001", "0001", "0002"]

@@ -14,26 +14,22 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from tqdm import tqdm
 
 from sdfhub.data import shards
+from sdfhub.data.comparison import damaged_shapes, remember
 from sdfhub.data.manifest import MANIFEST, VERSION, enter, new_manifest, read_manifest, write_manifest
 from sdfhub.data.sampling import Preparation, prepare_mesh
 from sdfhub.data.shards import StoredShape
-from sdfhub.data.sources.source import Shape, Source, state_of
+from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import ShapeSamples
-from sdfhub.whole_file import write_whole
-
-COMPARED = "compared.json"
-"""Beside the manifest: sizes and dates of files whose checksums were right. Without it all are compared."""
 
 PASSING = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
@@ -131,7 +127,7 @@ def prepare(
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
     manifest = read_manifest(folder) or new_manifest(source.name, preparation)
-    damaged = _damaged(shapes, manifest, folder)
+    damaged = damaged_shapes(_records(shapes, manifest), folder)
     if damaged or _missing(shapes, manifest):
         try:
             with _locked(folder):
@@ -240,9 +236,14 @@ def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> di
             enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
     finally:  # a run that is interrupted keeps what it has
         write_manifest(folder, manifest)
-    kept = {shape.id: manifest["shapes"].get(shape.id) for shape in shapes}
-    _remember(folder, {id: _state(folder / id, record) for id, record in kept.items() if record})
+    remember(_records(shapes, manifest), folder)
     return manifest
+
+
+def _records(shapes: list[Shape], manifest: dict) -> dict[str, dict]:
+    """What the manifest says of those shapes that it keeps, by id."""
+    kept = manifest["shapes"]
+    return {shape.id: kept[shape.id] for shape in shapes if shape.id in kept}
 
 
 def _left_after_folders(shapes: list[Shape], manifest: dict, folder: Path) -> list[Shape]:
@@ -269,49 +270,6 @@ def _crash_record(shape: Shape) -> dict:
     detail = "the worker process died: out of memory, or a fault in a native library"
     refusal = {"reason": "crash", "detail": detail}
     return {"fingerprint": shape.fingerprint, "category": shape.category, "rejected": refusal}
-
-
-def _damaged(shapes: list[Shape], manifest: dict, folder: Path) -> list[str]:
-    """Ids of the shapes whose files are not those that were prepared; told by name.
-
-    Files with the size and date that they had when they were last compared are not read again: a thousand
-    shapes are ten gigabytes.
-    """
-    records = {shape.id: manifest["shapes"].get(shape.id) for shape in shapes}
-    states = {id: _state(folder / id, record) for id, record in records.items() if record}
-    compared = _compared(folder)
-    fresh = [id for id, state in states.items() if state is None or compared.get(id) != state]
-    with ThreadPoolExecutor() as pool:  # hashing lets other threads run
-        found = pool.map(shards.damaged_files, [folder / id for id in fresh], [records[id] for id in fresh])
-    names = {id: wrong for id, wrong in zip(fresh, found, strict=True) if wrong}
-    for id, wrong in names.items():
-        files = ", ".join(f"{name}.npy" for name in wrong)
-        print(f"store: {folder / id}: {files} damaged (checksum): prepared again", flush=True)
-    if fresh:
-        _remember(folder, {id: states[id] for id in fresh if id not in names})
-    return list(names)
-
-
-def _remember(folder: Path, states: dict[str, str | None]) -> None:
-    """Notes states of shapes whose checksums are right."""
-    with suppress(OSError):  # a store that others own is read all the same
-        write_whole(folder / COMPARED, json.dumps(_compared(folder) | states))
-
-
-def _compared(folder: Path) -> dict[str, str]:
-    """States of shapes when their checksums were last compared."""
-    try:
-        return dict(json.loads((folder / COMPARED).read_text()))
-    except (OSError, ValueError, TypeError):
-        return {}
-
-
-def _state(folder: Path, record: Mapping) -> str | None:
-    """Sizes and dates of a shape's files; None where one is missing."""
-    try:
-        return " ".join(state_of(folder / f"{name}.npy") for name in sorted(record["files"]))
-    except OSError:
-        return None
 
 
 def _refuse_detours(shapes: list[Shape], folder: Path) -> None:
