@@ -1,4 +1,4 @@
-"""Whether the files of a store are still those that were written, without reading all of them at every start."""
+"""Whether the files of a store are still those that were written, without reading all at every start."""
 
 import json
 from collections.abc import Mapping
