@@ -104,7 +104,8 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     found = reconstruct_targets(how, targets, thresholds, out, together)
     results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
     print(table(results))
-    print(f"\nmeshes and codes: {out}")
+    if any(each.verdict != "failed" for each in results):
+        print(f"\nmeshes and codes: {out}")
     for each in results:
         if each.verdict == "failed":
             print(f"sdfhub: error: {each.reason}", file=sys.stderr)
