@@ -2,7 +2,7 @@
 
 Run: python benchmarks/soak.py [--minutes 120] [--every 3] [--seed 0] [--folder soak]
 
-Trains one run to its end, then the same again while signals reach it at random moments (SIGKILL, SIGTERM,
+Trains one run to its end, and beside it the same while signals reach it at random moments (SIGKILL, SIGTERM,
 SIGINT), each time started again by the same command. Prints how often it was stopped, and whether weights and
 final loss are those of the undisturbed run, bit by bit; status 1 where they are not.
 """
@@ -36,9 +36,8 @@ def command(folder: Path, name: str, epochs: int) -> list[str]:
     return [sys.executable, "train.py", *words, f"hydra.run.dir={folder / name}"]
 
 
-def trained(folder: Path, name: str, epochs: int) -> float:
-    """Seconds of a whole training."""
-    subprocess.run(command(folder, name, epochs), cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+def seconds_of(folder: Path, name: str) -> float:
+    """Seconds of a whole training, as it has written them."""
     return json.loads((folder / name / "metrics.json").read_text())["training"]["seconds"]
 
 
@@ -73,11 +72,19 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = os.environ.get("OMP_NUM_THREADS", "1")
     args.folder.mkdir(parents=True)
     folder = args.folder.resolve()
-    epochs = max(2, round(60 * args.minutes / trained(folder, "calibration", CALIBRATION) * CALIBRATION))
-    seconds = trained(folder, "undisturbed", epochs)
+    subprocess.run(
+        command(folder, "calibration", CALIBRATION), cwd=ROOT, check=True, stdout=subprocess.DEVNULL
+    )
+    epochs = max(2, round(60 * args.minutes / seconds_of(folder, "calibration") * CALIBRATION))
+    undisturbed = subprocess.Popen(
+        command(folder, "undisturbed", epochs), cwd=ROOT, stdout=subprocess.DEVNULL
+    )
     start = time.monotonic()
     stops = disturbed(folder, epochs, 60 * args.every, random.Random(args.seed))
     wall = time.monotonic() - start
+    if undisturbed.wait():
+        raise SystemExit(f"the undisturbed training ended with status {undisturbed.returncode}")
+    seconds = seconds_of(folder, "undisturbed")
     states, losses = [], []
     for name in ("undisturbed", "disturbed"):
         states.append(read_checkpoint(folder / name / "checkpoints" / LAST)["state_dict"])
