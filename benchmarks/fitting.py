@@ -29,7 +29,7 @@ from sdfhub.model.losses import clamped_l1
 from sdfhub.space import reconstruct
 from sdfhub.tasks.build import build
 from sdfhub.tasks.evaluate import Evaluation, fit_held_out
-from sdfhub.tasks.prepare import prepare_split
+from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.run import read_run
 
 FRESH = 40_000
@@ -43,7 +43,7 @@ def unseen_shapes(space: Path, count: int) -> list[StoredShape]:
     others = [shape for shape in source.shapes() if shape.id not in roles["train"]]
     chosen = Split([], split(others, 0, count, seed=1).test)
     preparation = build(config["data"]["preparation"], "data.preparation", within="sdfhub.data")
-    return prepare_split(source, chosen, preparation, config["data"] | {"workers": 1}).held_out
+    return stored_split(source, chosen, preparation, config["data"] | {"workers": 1}).held_out
 
 
 def evaluation(fit: str, together: int, seed: int) -> Evaluation:

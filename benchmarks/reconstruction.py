@@ -35,7 +35,7 @@ from sdfhub.geometry.render import render
 from sdfhub.tasks.app import configuration_folder, register_resolvers
 from sdfhub.tasks.build import build, plain
 from sdfhub.tasks.calibration import Alike, unseen_shapes
-from sdfhub.tasks.prepare import prepare_split
+from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.reconstruct import reconstructor, thresholds_of
 from sdfhub.tasks.reconstructor import Found, Reconstructor
 from sdfhub.tasks.run import read_run
@@ -55,7 +55,7 @@ def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     source = ProceduralSource({"lamps": {}})
     preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
     chosen = Split([], split(source.shapes(), 0, count, seed=0).test)
-    return prepare_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
+    return stored_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
 
 
 def fit_all(how: Reconstructor, targets: list[Target]) -> tuple[list[tuple[Mesh, float]], float]:

@@ -100,12 +100,12 @@ def test_a_class_that_takes_no_settings_is_refused(tmp_path):
         start(with_value("data.loader._target_", "sdfhub.errors.SdfhubError"), tmp_path)
 
 
-def test_a_misspelt_command_leaves_no_file(tmp_path, monkeypatch, capsys):
+def test_a_misspelt_command_leaves_no_file_and_no_folder_of_a_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0"])
+    monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0", "hydra.run.dir=runs/first"])
     with pytest.raises(SystemExit):
         train_task.main()
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert [path.name for path in tmp_path.rglob("*")] == ["runs"]
 
 
 def test_the_environment_is_not_read_into_settings(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import csv
 import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -39,7 +40,6 @@ TINY = [
     "evaluate.points=2000",
     "evaluate.fit.steps=20",
     "evaluate.fit.samples=500",
-    "trainer.enable_progress_bar=false",
 ]
 
 
@@ -87,6 +87,7 @@ def test_training_prints_the_table_and_where_everything_is(trained):
         "TensorBoard",
     ):
         assert words in printed
+    assert re.findall(r"epoch (\d) of 6: loss 0\.\d+", printed) == ["1", "2", "3", "4", "5", "6"]
     assert str(folder / "contact_sheet.png") in printed
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 import sdfhub
 from sdfhub.geometry.animation import animation
-from sdfhub.tasks import export, interpolate, neighbours, sample
+from sdfhub.tasks import export, interpolate, neighbours, reconstruct, sample
 from sdfhub.tasks.export import as_function, function_file
 from sdfhub.tasks.run import build_decoder
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
@@ -167,6 +167,13 @@ def test_help_is_the_tasks_own_keys_and_what_they_mean(task, monkeypatch, capsys
     printed = told(monkeypatch, capsys, task, "--help")
     assert "\nrun: ??? # folder of a run" in printed and "out: null # " in printed
     assert "hydra" not in printed.lower() and "activation" not in printed
+
+
+def test_help_tells_the_groups_of_a_task_and_no_others(monkeypatch, capsys):
+    printed = told(monkeypatch, capsys, reconstruct, "--help")
+    assert "method: map # one of deepsdf, map" in printed and "\n  nearest: 3 " in printed
+    assert "sensor: null # " in printed
+    assert not {"activation:", "_target_", "hydra"} & set(printed.lower().split())
 
 
 def test_a_missing_run_is_named(monkeypatch, capsys, tmp_path):

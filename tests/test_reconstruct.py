@@ -56,6 +56,7 @@ def scans(tmp_path_factory):
     frame = {"center": np.array([100.0, 0, 0]), "scale": np.ones(1) / 20}
     np.savez(folder / "samples.npz", points=seen.points, sdf=seen.low, **frame)
     (folder / "broken.xyz").write_text("no numbers\n")
+    (folder / "notes.txt").write_text("where they were taken\n")
     return folder
 
 
@@ -73,7 +74,8 @@ def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path
         "oriented": "unjudged",
         "samples": "unjudged",
     }
-    assert "broken.xyz" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "broken.xyz" in told and "passes over what is no scan: .txt" in told
     for name, centre, radius in (("bare", 0, 0.45), ("oriented", 0, 0.5), ("samples", [100.0, 0, 0], 10.0)):
         mesh = trimesh.load_mesh(tmp_path / f"{name}.ply")
         assert np.abs(np.linalg.norm(mesh.vertices - centre, axis=1) / radius - 1).max() < 0.15
@@ -162,7 +164,7 @@ def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch,
     begin_run(other, {"seed": 0, "model": {}}, ["a"], [], {}, "z")
     (other / "checkpoints").mkdir()
     (other / "checkpoints" / "last.ckpt").write_bytes((run / "checkpoints" / "last.ckpt").read_bytes())
-    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"target={scans}"])
+    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"target={scans / 'bare.npy'}"])
     with pytest.raises(SystemExit) as stop:
         task.main()
     message = capsys.readouterr().err.strip()

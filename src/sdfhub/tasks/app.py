@@ -51,7 +51,7 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
     A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
     line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]) and not _composed_groups(config_name):
+    if {"-h", "--help"} & set(sys.argv[1:]) and not _is_a_trainings(config_name):
         print(help_of(config_name))
         return
     failures: list[Exception] = []
@@ -99,9 +99,22 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
 
 
 def help_of(config_name: str) -> str:
-    """What a task without groups can be given: its YAML, whose comments say so, less what is Hydra's."""
-    text = (configuration_folder() / f"{config_name}.yaml").read_text(encoding="utf-8")
-    return re.sub(r"^(defaults|hydra):\n(?:[ ].*\n?|\n)*", "", text, flags=re.MULTILINE).rstrip()
+    """What a task can be given: its YAML and those of its groups, whose comments say what each key is."""
+    parts = [_told_by(configuration_folder() / f"{config_name}.yaml")]
+    for group, chosen in _composed_groups(config_name).items():
+        choices = ", ".join(sorted(path.stem for path in (configuration_folder() / group).glob("*.yaml")))
+        parts.append(f"{group}: {'null' if chosen is None else chosen} # one of {choices}")
+        if chosen is not None:
+            own = _told_by(configuration_folder() / group / f"{chosen}.yaml")
+            parts[-1] += "\n" + "\n".join(f"  {line}".rstrip() for line in own.splitlines())
+    return "\n\n".join(parts)
+
+
+def _told_by(path: Path) -> str:
+    """The text of a YAML less what is not for a user: the defaults list, Hydra's own keys, classes."""
+    text = path.read_text(encoding="utf-8")
+    text = re.sub(r"^(defaults|hydra):\n(?:[ ].*\n?|\n)*", "", text, flags=re.MULTILINE)
+    return re.sub(r"^ *(_target_|_partial_|# @package).*\n", "", text, flags=re.MULTILINE).rstrip()
 
 
 def first_word_as(key: str) -> None:
@@ -172,10 +185,23 @@ def _top_level_keys(config_name: str) -> list[str]:
     return list(dict.fromkeys([*keys, *_composed_groups(config_name)]))
 
 
-def _composed_groups(config_name: str) -> list[str]:
+def _composed_groups(config_name: str) -> dict[str, str | None]:
+    """The groups of a task's own config and what it takes of them; `config` brings a training's."""
     defaults = _yaml(configuration_folder() / f"{config_name}.yaml")["defaults"]
-    composed = [group for entry in defaults if isinstance(entry, dict) for group in entry]
-    return [group.removeprefix("override ") for group in composed if "hydra" not in group]
+    composed = {
+        group: choice for entry in defaults if isinstance(entry, dict) for group, choice in entry.items()
+    }
+    return {
+        name.removeprefix("override "): chosen for name, chosen in composed.items() if "hydra" not in name
+    }
+
+
+def _is_a_trainings(config_name: str) -> bool:
+    """Whether a config is that of a training or builds on it: twenty groups, which Hydra lists itself."""
+    return (
+        config_name == "config"
+        or "config" in _yaml(configuration_folder() / f"{config_name}.yaml")["defaults"]
+    )
 
 
 def _groups() -> list[str]:

@@ -21,7 +21,7 @@ from sdfhub.data.store import shape_seed
 from sdfhub.data.target import Target, observed
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.build import build
-from sdfhub.tasks.prepare import prepare_split
+from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
@@ -157,6 +157,7 @@ def calibrated(
     missing = [each for each in kinds if "threshold" not in known.get(str(each), {})]
     shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
     for each in missing:
+        print(f"calibration: {each}: fits {len(shapes)} unseen shapes, once", flush=True)
         targets = [each.target(shape, fitter.evidence) for shape in shapes]
         residuals = fitter.residuals(targets)
         entry = {"threshold": calibration.threshold(residuals), "residuals": residuals.tolist()}
@@ -178,7 +179,7 @@ def unseen_shapes(
     others = [shape for shape in others if shape.split == "test"] or others
     more = split(others, 0, min(count - len(first), len(others)), seed=0).test
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    found = prepare_split(source, Split([], first + more), preparation, data).held_out
+    found = stored_split(source, Split([], first + more), preparation, data).held_out
     if len(found) < 3:
         raise SdfhubError(f"the run's data has {len(found)} unseen shapes, a calibration needs 3")
     return found

@@ -82,6 +82,18 @@ class LossBar(TQDMProgressBar):
         return {key: value for key, value in super().get_metrics(trainer, module).items() if key != "v_num"}
 
 
+class LossLines(L.Callback):
+    """Where nobody watches a bar: a line with the last step's loss at every tenth of a training."""
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
+        self._loss = outputs["loss"]
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+        done, whole = trainer.current_epoch + 1, trainer.max_epochs
+        if trainer.is_global_zero and done * 10 // whole > (done - 1) * 10 // whole:
+            print(f"epoch {done} of {whole}: loss {float(self._loss):.4g}", flush=True)
+
+
 class MeshShapes(L.Callback):
     """Every so often: meshes the first shapes, logs their metrics, the meshes beside the truth, and slices.
 

@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from sdfhub.data import store as stores
+from sdfhub.data.sampling import Preparation
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
@@ -71,9 +72,24 @@ def prepare_part(data: Mapping[str, Any], part: str) -> None:
 
 
 def prepare_split(
-    source, roles: Split, preparation, data: Mapping[str, Any], progress: bool = True
+    source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any], progress: bool = True
 ) -> Prepared:
-    """The stored shapes of a given split."""
+    """The stored shapes of a given split; prints what came of it."""
+    prepared = stored_split(source, roles, preparation, data, progress)
+    asked, train, held_out = len(roles.train + roles.test), len(prepared.train), len(prepared.held_out)
+    lost = asked - train - held_out
+    print(
+        f"data: {source.name}: {_counted(train)} to train on, {held_out} held out"
+        + (f" ({_counted(asked)} asked for, {lost} rejected)" if lost else "")
+    )
+    print(f"store: {prepared.store.folder}: {prepared.store.summary()}")
+    return prepared
+
+
+def stored_split(
+    source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any], progress: bool = True
+) -> Prepared:
+    """The stored shapes of a given split, without a word."""
     store = stores.prepare(
         source,
         roles.train + roles.test,
@@ -84,12 +100,6 @@ def prepare_split(
     )
     train = [store[shape.id] for shape in roles.train if shape.id in store]
     held_out = [store[shape.id] for shape in roles.test if shape.id in store]
-    lost = len(roles.train) + len(roles.test) - len(train) - len(held_out)
-    print(
-        f"data: {source.name}: {_counted(len(train))} to train on, {len(held_out)} held out"
-        + (f" ({_counted(len(roles.train + roles.test))} asked for, {lost} rejected)" if lost else "")
-    )
-    print(f"store: {store.folder}: {store.summary()}")
     return Prepared(train, held_out, store)
 
 

@@ -31,9 +31,12 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     for path in map(Path, [wanted] if isinstance(wanted, str) else wanted):
         inside = [path]
         if path.is_dir():
-            inside = sorted(each for each in path.rglob("*") if each.suffix.lower() in FORMATS)
+            files = sorted(each for each in path.rglob("*") if each.is_file())
+            inside = [each for each in files if each.suffix.lower() in FORMATS]
             if not inside:
                 raise SdfhubError(f"target={path}: holds no scans ({' '.join(FORMATS)})")
+            if others := sorted({each.suffix.lower() or each.name for each in set(files) - set(inside)}):
+                print(f"target={path}: passes over what is no scan: {' '.join(others)}", file=sys.stderr)
         named |= {each: each.stem for each in inside}
     if not named:
         raise SdfhubError("target: names no scan")

@@ -21,7 +21,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.callbacks import LossBar, TrainingRecord
+from sdfhub.tasks.callbacks import LossBar, LossLines, TrainingRecord
 from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
@@ -133,8 +133,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     callbacks += [record, *checkpointing(run / "checkpoints", **every)]
     bar = check(config["trainer"].get("enable_progress_bar", True), bool, "trainer.enable_progress_bar")
     watched = bar and sys.stdout.isatty()
-    if watched:  # in a file a bar is ten thousand lines
-        callbacks.append(LossBar())
+    if bar:  # in a file a bar is ten thousand lines
+        callbacks.append(LossBar() if watched else LossLines())
     return Parts(
         evaluation=build(config["evaluate"], "evaluate"),
         loading=build(config["data"]["loader"], "data.loader"),
@@ -200,6 +200,12 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
         raise SdfhubError(f"trainer: {error}{hint}") from error
 
 
+def leave_no_empty_folder(folder: Path) -> None:
+    """Removes what Hydra made for a run that never began."""
+    if folder.is_dir() and not any(folder.iterdir()) and folder.resolve() != Path.cwd():
+        folder.rmdir()
+
+
 def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
@@ -217,7 +223,12 @@ def main() -> None:
         for group in ("sweeps", "search"):
             if name := hydra.runtime.choices.get(group):
                 raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
-        go_on(train, plain(config), Path(hydra.runtime.output_dir))
+        folder = Path(hydra.runtime.output_dir)
+        try:
+            go_on(train, plain(config), folder)
+        except SdfhubError:
+            leave_no_empty_folder(folder)
+            raise
         return None
 
     run_task(task, "config")
