@@ -59,14 +59,14 @@ def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
 
 
 def fit_all(how: Reconstructor, targets: list[Target]) -> tuple[list[tuple[Mesh, float]], float]:
-    """Mesh and residual of each target, and processor seconds a fit."""
+    """Mesh of each target and doubt about it, and processor seconds a fit."""
     found, seconds = [], 0.0
     for target in targets:
         start = time.process_time()
         fitted = how.fit([target])
         seconds += time.process_time() - start
         mesh, _ = next(how.meshes([target], fitted))
-        found.append((mesh, float(fitted.residuals)))
+        found.append((mesh, float(how.doubts_about(fitted))))
     return found, seconds / max(1, len(targets))
 
 
@@ -75,8 +75,8 @@ def excesses(shapes: list[StoredShape], meshes: list[Mesh]) -> np.ndarray:
     return np.array([np.nan if each is None else each * 1e3 for each in found])
 
 
-def right_verdicts(residuals: list[float], threshold: float | None, wanted: str) -> str:
-    given = [Found("", residual=each, mesh="m").judged(threshold, True).verdict for each in residuals]
+def right_verdicts(doubts: list[float], threshold: float | None, wanted: str) -> str:
+    given = [Found("", doubt=each, mesh="m").judged(threshold, True).verdict for each in doubts]
     return f"{given.count(wanted)}/{len(given)}"
 
 
@@ -138,12 +138,12 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
         threshold = thresholds_of(run, how, [kind], config).get(kind)
         own, seconds = fit_all(how, [kind.target(each, how.evidence) for each in shapes])
         others, _ = fit_all(how, [kind.target(each, how.evidence) for each in strangers])
-        meshes, residuals, strange = [m for m, _ in own], [r for _, r in own], [r for _, r in others]
+        meshes, doubts, strange = [m for m, _ in own], [r for _, r in own], [r for _, r in others]
         excess = excesses(shapes, meshes)
         base = np.nanmedian(excess) if name == "samples" else base
-        right = right_verdicts(residuals, threshold, "fitted"), right_verdicts(strange, threshold, "doubtful")
+        right = right_verdicts(doubts, threshold, "fitted"), right_verdicts(strange, threshold, "doubtful")
         row(name, excess, base, seconds, *right)
-        lists = {"excess": excess, "residuals": residuals, "strangers": strange}
+        lists = {"excess": excess, "doubts": doubts, "strangers": strange}
         said = "; ".join(f"{key} {np.round(values, 5).tolist()}" for key, values in lists.items())
         print(f"{name}: threshold {threshold}; {said}", file=sys.stderr, flush=True)
         if name == "view":

@@ -92,14 +92,14 @@ def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):
 
 
 def test_thresholds_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypatch):
-    """The run's data are chairs, which its space of balls cannot fit: their residuals are large."""
+    """The run's data are chairs, which its space of balls cannot fit: the doubts are large."""
     first = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
     kept = json.loads((run / calibrations.FILE).read_text())
     (entry,) = next(iter(kept.values())).values()
     assert first[0].verdict == "fitted" and first[0].threshold == entry["threshold"]
-    assert len(entry["residuals"]) == len(entry["shapes"]) == 3
+    assert len(entry["doubts"]) == len(entry["shapes"]) == 3
     assert entry["shapes"][:2] == ["chairs/0007", "chairs/0009"], "the held-out ones first"
-    assert min(entry["residuals"]) > 3 * first[0].residual
+    assert min(entry["doubts"]) > 3 * first[0].doubt
     monkeypatch.setattr(calibrations, "unseen_shapes", None)  # a second measurement would fail
     again = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
     assert again == first
@@ -115,14 +115,14 @@ def test_without_the_runs_data_there_are_meshes_but_no_verdicts(run, scans, tmp_
 
 
 def test_a_threshold_lies_above_what_it_was_measured_on():
-    residuals = np.exp(np.random.default_rng(0).normal(-6, 0.3, 200))
-    threshold = Calibration(shapes=200, spread=2.5, reach=1.5).threshold(residuals)
-    assert (residuals <= threshold).mean() > 0.98 and threshold < 2 * np.exp(-6 + 2.5 * 0.3)
+    doubts = np.exp(np.random.default_rng(0).normal(-6, 0.3, 200))
+    threshold = Calibration(shapes=200, spread=2.5, reach=1.5).threshold(doubts)
+    assert (doubts <= threshold).mean() > 0.98 and threshold < 2 * np.exp(-6 + 2.5 * 0.3)
 
 
-def test_a_threshold_stays_near_the_worst_however_far_residuals_spread():
-    residuals = np.array([0.001, 0.002, 0.02])
-    assert Calibration(shapes=3, spread=2.5, reach=1.5).threshold(residuals) == pytest.approx(0.03)
+def test_a_threshold_stays_near_the_worst_however_far_doubts_spread():
+    doubts = np.array([0.001, 0.002, 0.02])
+    assert Calibration(shapes=3, spread=2.5, reach=1.5).threshold(doubts) == pytest.approx(0.03)
 
 
 def test_scans_are_judged_by_scans_like_them():

@@ -23,6 +23,13 @@ class Normal(NamedTuple):
         noise = torch.randn(count, len(self.mean), generator=torch.Generator().manual_seed(seed))
         return self.mean + noise.to(self.mean) @ torch.linalg.cholesky(self.covariance).mT
 
+    def unusual(self, codes: Tensor) -> Tensor:
+        """[B] squared Mahalanobis distances of codes [B, L] over L: 1 on average for codes drawn from it."""
+        apart = torch.linalg.solve_triangular(
+            torch.linalg.cholesky(self.covariance), (codes - self.mean).mT, upper=False
+        )
+        return apart.square().mean(0)
+
 
 class Prior(Protocol):
     """How a distribution of codes comes from a table of them."""

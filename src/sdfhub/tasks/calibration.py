@@ -1,4 +1,4 @@
-"""When a fit is doubtful: by what unseen shapes of a run's own data leave as residuals, scanned alike.
+"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, left less doubt.
 
 A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
 """
@@ -38,7 +38,7 @@ class Calibration:
 
     Args:
         shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
-        spread: standard deviations that the logarithm of a residual may lie above the mean of theirs, > 0.
+        spread: standard deviations that the logarithm of a doubt may lie above the mean of theirs, > 0.
         reach: times the largest of theirs, however far theirs spread, > 0.
     """
 
@@ -50,11 +50,11 @@ class Calibration:
         if (self.shapes < 3 and self.shapes != 0) or min(self.spread, self.reach) <= 0:
             raise ValueError("shapes must be at least 3, or 0 for no verdicts; spread and reach positive")
 
-    def threshold(self, residuals: np.ndarray) -> float:
-        """The residual above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
-        logarithms = np.log(np.maximum(residuals, 1e-12))
+    def threshold(self, doubts: np.ndarray) -> float:
+        """The doubt above which a fit is doubtful, from those [S] about shapes known to be of the kind."""
+        logarithms = np.log(np.maximum(doubts, 1e-12))
         usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
-        return float(min(usual, self.reach * np.max(residuals)))
+        return float(min(usual, self.reach * np.max(doubts)))
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ class Fitter(Protocol):
 
     evidence: Evidence
 
-    def residuals(self, targets: Sequence[Target]) -> np.ndarray:
-        """The residuals [B] of targets."""
+    def doubts(self, targets: Sequence[Target]) -> np.ndarray:
+        """The doubts [B] about targets."""
 
 
 def calibrated(
@@ -146,7 +146,7 @@ def calibrated(
         calibration: how.
         kinds: that are wanted.
         fitter: fits targets.
-        settings: plain, all that residuals depend on.
+        settings: plain, all that doubts depend on.
         data: keys that stand in for the run's own (store, workers).
 
     Raises:
@@ -159,8 +159,8 @@ def calibrated(
     for each in missing:
         print(f"calibration: {each}: fits {len(shapes)} unseen shapes, once", flush=True)
         targets = [each.target(shape, fitter.evidence) for shape in shapes]
-        residuals = fitter.residuals(targets)
-        entry = {"threshold": calibration.threshold(residuals), "residuals": residuals.tolist()}
+        doubts = fitter.doubts(targets)
+        entry = {"threshold": calibration.threshold(doubts), "doubts": doubts.tolist()}
         known[str(each)] = entry | {"shapes": [shape.id for shape in shapes]}
         write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
     return {each: float(known[str(each)]["threshold"]) for each in kinds}

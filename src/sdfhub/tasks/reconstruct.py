@@ -60,9 +60,11 @@ def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
     """The space of a run or an exported file, and how it is to be used."""
     frame = check(config["frame"], Frame, "frame")
     space = load(run)
+    prior = build(config["prior"], "prior", within="sdfhub.model")
     poses = build(config["poses"], "poses", within="sdfhub.model", up=space.up)
     return Reconstructor(
         space,
+        likely=prior(space.codes),
         method=build(config["method"], "method", within="sdfhub.model"),
         evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
         frame=frame,
@@ -78,7 +80,7 @@ def thresholds_of(
     calibration = build(config["calibration"], "calibration")
     if not calibration.shapes:
         return {}
-    settings = {key: config[key] for key in ("method", "evidence", "calibration")}
+    settings = {key: config[key] for key in ("method", "prior", "evidence", "calibration")}
     settings["poses"] = config["poses"] if how.poses else None
     try:
         trained, roles = read_run(run)

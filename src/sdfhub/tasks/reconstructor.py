@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from torch import Tensor
 from tqdm import tqdm
 
 from sdfhub.data.evidence import Evidence
@@ -14,6 +15,7 @@ from sdfhub.data.scan import read_scan
 from sdfhub.data.target import Frame, Target, observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
+from sdfhub.model.prior import Normal
 from sdfhub.model.reconstruction import Fitted, Method
 from sdfhub.model.similarity import PoseRange
 from sdfhub.space import Space
@@ -28,6 +30,7 @@ class Reconstructor:
 
     Args:
         space: where codes are looked for.
+        likely: codes of that space.
         method: finds codes and poses.
         evidence: what a scan says.
         frame: of the scans.
@@ -36,6 +39,7 @@ class Reconstructor:
     """
 
     space: Space
+    likely: Normal
     method: Method
     evidence: Evidence
     frame: Frame
@@ -68,10 +72,17 @@ class Reconstructor:
         except ValueError as error:
             raise SdfhubError(f"method: {error}") from error
 
-    def residuals(self, targets: Sequence[Target]) -> np.ndarray:
-        """The residuals [B] of targets whose shapes nobody asked for."""
+    def doubts(self, targets: Sequence[Target]) -> np.ndarray:
+        """The doubts [B] about targets whose shapes nobody asked for."""
         bar = tqdm(targets, desc="calibrating", unit="shape", leave=False, disable=None)
-        return np.array([float(self.fit([each]).residuals) for each in bar])
+        return np.array([float(self.doubts_about(self.fit([each]))) for each in bar])
+
+    def doubts_about(self, fitted: Fitted) -> Tensor:
+        """[B] residuals, each times one plus how unusual its code is.
+
+        A space can bend to a stranger: little is left then, but the code lies where none of its own do.
+        """
+        return fitted.residuals * (1 + self.likely.unusual(fitted.codes))
 
     def meshes(self, targets: Sequence[Target], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
         """Meshes in the targets' own frames, and the matrices [4, 4] from the normalised frame to these."""
@@ -98,7 +109,8 @@ class Found:
         name: of its files.
         kind: what it was judged as; empty where it failed.
         residual: mean violation of the scan's bounds, normalised units.
-        threshold: residual above which the fit is doubtful; None where nothing was calibrated.
+        doubt: the same times one plus how unusual its code is.
+        threshold: doubt above which the fit is doubtful; None where nothing was calibrated.
         verdict: fitted, doubtful, unjudged (not calibrated) or failed.
         reason: of a verdict other than fitted.
         code: [L] numbers.
@@ -109,6 +121,7 @@ class Found:
     name: str
     kind: str = ""
     residual: float | None = None
+    doubt: float | None = None
     threshold: float | None = None
     verdict: Literal["fitted", "doubtful", "unjudged", "failed"] = "failed"
     reason: str = ""
@@ -120,7 +133,7 @@ class Found:
         """The same with a verdict.
 
         Args:
-            threshold: of residuals of its kind of scan; None where nothing was calibrated.
+            threshold: of doubts about its kind of scan; None where nothing was calibrated.
             is_near: whether its pose lies within the range of poses.
         """
         if self.mesh is None:
@@ -129,8 +142,8 @@ class Found:
             verdict, reason = "doubtful", "its pose lies outside the range of poses"
         elif threshold is None:
             verdict, reason = "unjudged", "nothing was calibrated"
-        elif not self.residual <= threshold:
-            verdict, reason = "doubtful", "its residual is above that of shapes of this space"
+        elif not self.doubt <= threshold:
+            verdict, reason = "doubtful", "residual and code are unlike those of this space's shapes"
         else:
             verdict, reason = "fitted", ""
         return replace(self, threshold=threshold, verdict=verdict, reason=reason)
@@ -168,6 +181,7 @@ def _reconstruct_group(
 ) -> list[Found]:
     targets, found = list(group.values()), []
     fitted = how.fit(targets)
+    doubts = how.doubts_about(fitted).tolist()
     near = how.poses.holds(fitted.poses).tolist() if fitted.poses else [True] * len(group)
     for row, (mesh, matrix) in enumerate(how.meshes(targets, fitted)):
         name, kind = list(group)[row], Alike.to(targets[row])
@@ -175,6 +189,7 @@ def _reconstruct_group(
             name,
             kind=str(kind),
             residual=float(fitted.residuals[row]),
+            doubt=doubts[row],
             code=tuple(fitted.codes[row].tolist()),
             frame=tuple(map(tuple, matrix.tolist())),
             mesh=f"{name}.ply" if len(mesh[1]) else None,
@@ -192,11 +207,11 @@ def _write(found: Found, mesh: Mesh, out: Path) -> None:
 
 
 def table(results: Sequence[Found]) -> str:
-    """A line a scan: verdict, residual times 10^3 and its threshold, what it was judged as."""
+    """A line a scan: verdict, residual, doubt and its threshold, each times 10^3, what it was judged as."""
     width = max(len("scan"), *(len(each.name) for each in results)) + 2
-    lines = [f"{'scan':<{width}}{'verdict':<10}{'residual x10^3':>15}{'at most':>9}  judged as"]
+    lines = [f"{'scan':<{width}}{'verdict':<10}{'residual x10^3':>15}{'doubt':>9}{'at most':>9}  judged as"]
     for each in results:
-        numbers = ((each.residual, 15), (each.threshold, 9))
+        numbers = ((each.residual, 15), (each.doubt, 9), (each.threshold, 9))
         cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
         why = f"; {each.reason}" if each.reason and each.verdict != "failed" else ""
         lines.append(f"{each.name:<{width}}{each.verdict:<10}{''.join(cells)}  {each.kind}{why}")
