@@ -5,29 +5,35 @@
 
 Shapes: of the space's source, neither trained on nor calibrated with. Kinds: signed samples; 8192 points with
 normals; the same bare; the same with noise of 0.5% of the size (0.01: in the normalised frame, shapes are
-some 2 long); one view of 100 x 100 rays, from a known place. All in the normalised frame. Strangers: lamps,
-scanned alike; the right verdict is `fitted` on the space's own kind, `doubtful` on them. CD: meshes at 128^3,
-30,000 points a side, excess over the noise floor, times 10^3; ratio: of medians, to signed samples. Seconds:
-of the processor, one thread, fitting alone. With --reference also DeepSDF's recipe on the first shapes, from
-signed samples and from the oriented cloud (whose tight bounds are its samples). Of views also the distance of
-the true surface to the reconstruction, times 10^3: median of shapes, where seen (within 0.02 of a scan point)
-and where not.
+some 2 long); one view of 100 x 100 rays, from a known place; all in the normalised frame. Then the cloud with
+normals and the view again, `turned`: about the upright axis by any angle, tilted by up to 10 degrees, of any
+size and place, fitted with frame=unknown; their meshes are judged back in the normalised frame. Strangers:
+lamps, scanned alike; the right verdict is `fitted` on the space's own kind, `doubtful` on them. CD: meshes at
+128^3, 30,000 points a side, excess over the noise floor, times 10^3; ratio: of medians, to signed samples.
+Seconds: of the processor, one thread, fitting alone. With --reference also DeepSDF's recipe on the first
+shapes, from signed samples and from the oriented cloud (whose tight bounds are its samples). Of views also
+the distance of the true surface to the reconstruction, times 10^3: median of shapes, where seen (within 0.02
+of a scan point) and where not.
 """
 
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from sdfhub.data.scan import Scan
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import Split, split
-from sdfhub.data.target import Target
+from sdfhub.data.store import shape_seed
+from sdfhub.data.target import Target, observed
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import judge, point_to_surface, sample_surface
@@ -46,7 +52,11 @@ KINDS = {
     "bare": Alike("bare", 8192, 0.0),
     "noisy": Alike("bare", 8192, 0.01),
     "view": Alike("view", 0, 0.0),
+    "turned": Alike("oriented", 8192, 0.0),
+    "turned view": Alike("view", 0, 0.0),
 }
+TILT = 10.0
+"""Degrees by which the upright axis of turned scans is off at most."""
 SEEN = 0.02
 """Distance to a scan point within which a true surface point counts as seen."""
 
@@ -58,15 +68,50 @@ def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     return stored_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
 
 
-def fit_all(how: Reconstructor, targets: list[Target]) -> tuple[list[tuple[Mesh, float]], float]:
-    """Mesh of each target and doubt about it, and processor seconds a fit."""
+def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:
+    """A scan in a frame that nobody knows, and the matrix [4, 4] back from there."""
+    rng = np.random.default_rng(shape_seed(shape))
+    lie = Rotation.from_euler("x" if shape.up == "z" else "z", rng.uniform(-TILT, TILT), degrees=True)
+    yaw = Rotation.from_euler(shape.up, rng.uniform(0, 360), degrees=True)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rng.uniform(0.1, 10) * (lie * yaw).as_matrix()
+    matrix[:3, 3] = rng.uniform(-5, 5, 3)
+    turn = None if scan.normals is None else scan.normals @ (lie * yaw).as_matrix().T
+    sensor = None if scan.sensor is None else applied(matrix, scan.sensor)
+    there = replace(scan, points=applied(matrix, scan.points), normals=turn, sensor=sensor)
+    return there, np.linalg.inv(matrix)
+
+
+def applied(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def targets_of(
+    how: Reconstructor, kind: Alike, shapes: list[StoredShape]
+) -> tuple[list[Target], list[np.ndarray]]:
+    """What is observed of shapes, and the matrices from the scans' frames to the normalised one."""
+    if how.poses is None:
+        return [kind.target(each, how.evidence) for each in shapes], [np.eye(4)] * len(shapes)
+    scans = [moved(kind.scan(each), each) for each in shapes]
+    rngs = [np.random.default_rng(shape_seed(each)) for each in shapes]
+    found = [observed(scan, how.evidence, "unknown", rng) for (scan, _), rng in zip(scans, rngs, strict=True)]
+    return found, [matrix for _, matrix in scans]
+
+
+def fit_all(
+    how: Reconstructor, kind: Alike, shapes: list[StoredShape]
+) -> tuple[list[tuple[Mesh, float]], float]:
+    """Mesh of each shape, in the normalised frame, and doubt about it, and processor seconds a fit."""
+    targets, matrices = targets_of(how, kind, shapes)
     found, seconds = [], 0.0
-    for target in targets:
+    for target, matrix in zip(targets, matrices, strict=True):
         start = time.process_time()
         fitted = how.fit([target])
         seconds += time.process_time() - start
-        mesh, _ = next(how.meshes([target], fitted))
-        found.append((mesh, float(how.doubts_about(fitted))))
+        (vertices, faces), _ = next(how.meshes([target], fitted))
+        near = how.poses is None or bool(how.poses.holds(fitted.poses))
+        doubt = float(how.doubts_about(fitted)) if near else np.inf
+        found.append(((applied(matrix, vertices), faces), doubt))
     return found, seconds / max(1, len(targets))
 
 
@@ -124,20 +169,21 @@ def configured(run: Path, overrides: list[str], method: str) -> dict:
 
 
 def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
-    run, config = arguments.space, configured(arguments.space, overrides, "map")
+    run, still = arguments.space, configured(arguments.space, overrides, "map")
+    turned = configured(arguments.space, [*overrides, "frame=unknown"], "map")
     trained, roles = read_run(run)
-    how = reconstructor(run, config)
-    first = config["calibration"]["shapes"]
-    shapes = unseen_shapes(trained, roles, config["data"], first + arguments.shapes)[first:]
+    first = still["calibration"]["shapes"]
+    shapes = unseen_shapes(trained, roles, still["data"], first + arguments.shapes)[first:]
     strangers = prepared_lamps(arguments.strangers, trained)
     head = "| scan | excess median | mean | ratio | no surface | own fitted | strangers doubtful | s |"
     print(f"{head}\n{'| --- ' * 8}|", flush=True)
     base, sheet = arguments.base or np.nan, {"truth": [render_of(truth_of(each)) for each in shapes]}
     for name in arguments.kinds:
-        kind = KINDS[name]
+        kind, config = KINDS[name], turned if "turned" in name else still
+        how = reconstructor(run, config)
         threshold = thresholds_of(run, how, [kind], config).get(kind)
-        own, seconds = fit_all(how, [kind.target(each, how.evidence) for each in shapes])
-        others, _ = fit_all(how, [kind.target(each, how.evidence) for each in strangers])
+        own, seconds = fit_all(how, kind, shapes)
+        others, _ = fit_all(how, kind, strangers)
         meshes, doubts, strange = [m for m, _ in own], [r for _, r in own], [r for _, r in others]
         excess = excesses(shapes, meshes)
         base = np.nanmedian(excess) if name == "samples" else base
@@ -146,8 +192,8 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
         lists = {"excess": excess, "doubts": doubts, "strangers": strange}
         said = "; ".join(f"{key} {np.round(values, 5).tolist()}" for key, values in lists.items())
         print(f"{name}: threshold {threshold}; {said}", file=sys.stderr, flush=True)
-        if name == "view":
-            print(f"\nview, true surface to reconstruction: {view_line(shapes, kind, meshes)}\n")
+        if "view" in name:
+            print(f"\n{name}, true surface to reconstruction: {view_line(shapes, kind, meshes)}\n")
         sheet[name] = list(map(render_of, meshes))
         if arguments.reference and name in ("samples", "oriented"):
             compare_with_deepsdf(arguments, overrides, kind, shapes, excess, base)
@@ -165,7 +211,7 @@ def compare_with_deepsdf(
 ) -> None:
     count = arguments.reference
     rival = reconstructor(arguments.space, configured(arguments.space, overrides, "deepsdf"))
-    theirs, seconds = fit_all(rival, [kind.target(each, rival.evidence) for each in shapes[:count]])
+    theirs, seconds = fit_all(rival, kind, shapes[:count])
     row(f"{kind.kind}, first {count}", excess[:count], base, np.nan)
     other = excesses(shapes[:count], [mesh for mesh, _ in theirs])
     row(f"{kind.kind}, first {count}, DeepSDF's recipe", other, base, seconds)
