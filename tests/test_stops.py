@@ -126,13 +126,32 @@ def processes_of(word: str) -> list[int]:
     return sorted(found)
 
 
+def test_two_processes_told_to_stop_leave_one_checkpoint_and_go_on(undisturbed):
+    root, _ = undisturbed
+    folder = root / "two_told"
+    words = in_two(overrides(root, folder, epochs=40))
+    main = begun(words, folder)
+    main.send_signal(signal.SIGTERM)
+    told, _ = main.communicate(timeout=60)
+    assert main.returncode == 143 and "stopped after step" in told and "Traceback" not in told, told
+    assert not processes_of(str(folder))
+    stopped = read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"]
+    done = run(["train.py"], *words)
+    assert "goes on from last.ckpt" in done.stdout
+    assert 0 < stopped < read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"] == 400
+
+
+def in_two(words: list[str]) -> list[str]:
+    """A training's words for two processes."""
+    ddp = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    return [word for word in words if word != "trainer=cpu"] + ddp
+
+
 @pytest.mark.parametrize("victim", [0, 1])
 def test_when_one_process_of_many_dies_the_others_end_within_a_minute(victim, undisturbed):
     root, _ = undisturbed
     folder = root / f"two_{victim}"
-    words = [word for word in overrides(root, folder, epochs=5000) if word != "trainer=cpu"]
-    words += ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    main = begun(words, folder)
+    main = begun(in_two(overrides(root, folder, epochs=5000)), folder)
     both = processes_of(str(folder))
     assert len(both) >= 2 and main.pid in both
     children = [pid for pid in both if pid != main.pid]
