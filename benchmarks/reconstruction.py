@@ -9,7 +9,7 @@ some 2 long); one view of 100 x 100 rays, from a known place; all in the normali
 normals and the view again, `turned`: about the upright axis by any angle, tilted by up to 10 degrees, of any
 size and place, fitted with frame=unknown; their meshes are judged back in the normalised frame. Strangers:
 lamps, scanned alike; the right verdict is `fitted` on the space's own kind, `doubtful` on them. CD: meshes at
-128^3, 30,000 points a side, excess over the noise floor, times 10^3; ratio: of medians, to signed samples.
+256^3, 30,000 points a side, excess over the noise floor, times 10^3; ratio: of medians, to signed samples.
 Seconds: of the processor, one thread, fitting alone. With --reference also DeepSDF's recipe on the first
 shapes, from signed samples and from the oriented cloud (whose tight bounds are its samples). Of views also
 the distance of the true surface to the reconstruction, times 10^3: median of shapes, where seen (within 0.02
