@@ -145,6 +145,14 @@ def test_neighbours_are_the_nearest_codes_and_a_shape_is_not_its_own(space):
     assert space.neighbours(space.codes[2] + 1e-4, k=1)[0][0] == IDS[2]
 
 
+def test_a_strangers_code_is_unusual_and_known_ones_are_not(space):
+    known = space.unusual(space.codes)
+    far = space.codes.mean(0) + 10 * (space.codes[0] - space.codes.mean(0))
+    assert known.shape == (len(space.codes),) and known.mean() < 1.1
+    torch.testing.assert_close(space.unusual(far), 100 * known[0])
+    torch.testing.assert_close(space.unusual(IDS[:2]), known[:2])
+
+
 def test_samples_follow_the_distribution_of_the_codes():
     torch.manual_seed(0)
     codes = torch.randn(400, 3) @ torch.tensor([[2.0, 0.3, 0.0], [0.0, 0.5, 0.1], [0.0, 0.0, 0.1]]) + 5

@@ -198,6 +198,7 @@ def test_a_mesh_is_fitted_offered_and_shown_with_its_points(viewer, space):
     assert viewer.scan.visible and viewer.overlay.visible
     np.testing.assert_allclose(np.linalg.norm(viewer.scan.points, axis=1), 1 / 1.03, atol=0.01)
     assert "off the fitted one" in viewer.message.content
+    assert "Doubtful" in viewer.message.content, "its radius is twice that of any ball of the space"
     viewer.a.value = IDS[0]
     shows(viewer, IDS[0])
     wait_until(lambda: not viewer.scan.visible)

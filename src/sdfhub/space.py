@@ -36,7 +36,7 @@ from sdfhub.geometry.mesher import Mesh, mesh_fields
 from sdfhub.model.computing import Computing
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.distribution import CodeDistribution
-from sdfhub.model.reconstruction import Method
+from sdfhub.model.reconstruction import MapFit
 from sdfhub.shapes import NORMALIZED, Frame, check_id
 
 Array = np.ndarray | Tensor
@@ -68,7 +68,7 @@ class Space:
     config: dict[str, Any]
     metrics: dict[str, Any] | None
     evidence: Evidence
-    method: Method
+    method: MapFit
 
     def __post_init__(self):
         for id in self.ids:
@@ -212,6 +212,15 @@ class Space:
         values, rows = distances.topk(min(k, len(self.ids)), largest=False)
         found = zip(rows.tolist(), values.tolist(), strict=True)
         return [(self.ids[row], value) for row, value in found if np.isfinite(value)]
+
+    def unusual(self, shape: Shape | Sequence[Shape]) -> Tensor:
+        """How far codes lie from the known ones, [] or [B]: about 1 for these, 10 for those of strangers.
+
+        The squared Mahalanobis distance over L, by the prior under which shapes are fitted.
+        """
+        codes = self.code(shape)
+        values = self.method.prior(self.codes).unusual(codes.reshape(-1, codes.shape[-1]))
+        return values.reshape(codes.shape[:-1])
 
     @cached_property
     def distribution(self) -> CodeDistribution:

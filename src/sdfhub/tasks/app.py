@@ -51,7 +51,7 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
     A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
     line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]) and not _is_a_trainings(config_name):
+    if {"-h", "--help"} & set(sys.argv[1:]) and config_name != "config":
         print(help_of(config_name))
         return
     failures: list[Exception] = []
@@ -101,6 +101,8 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
 def help_of(config_name: str) -> str:
     """What a task can be given: its YAML and those of its groups, whose comments say what each key is."""
     parts = [_told_by(configuration_folder() / f"{config_name}.yaml")]
+    if "config" in _yaml(configuration_folder() / f"{config_name}.yaml")["defaults"]:
+        return parts[0] + "\n\n# and every group and key of a training: python train.py --help"
     for group, chosen in _composed_groups(config_name).items():
         choices = ", ".join(sorted(path.stem for path in (configuration_folder() / group).glob("*.yaml")))
         parts.append(f"{group}: {'null' if chosen is None else chosen} # one of {choices}")
@@ -194,14 +196,6 @@ def _composed_groups(config_name: str) -> dict[str, str | None]:
     return {
         name.removeprefix("override "): chosen for name, chosen in composed.items() if "hydra" not in name
     }
-
-
-def _is_a_trainings(config_name: str) -> bool:
-    """Whether a config is that of a training or builds on it: twenty groups, which Hydra lists itself."""
-    return (
-        config_name == "config"
-        or "config" in _yaml(configuration_folder() / f"{config_name}.yaml")["defaults"]
-    )
 
 
 def _groups() -> list[str]:

@@ -18,7 +18,7 @@ from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, calibrated
 from sdfhub.tasks.opening import beside, load
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
-from sdfhub.tasks.run import read_run, refuse_unwritable
+from sdfhub.tasks.run import leave_no_empty_folder, read_run, refuse_unwritable
 
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
@@ -108,9 +108,10 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     together = 1 if how.space.device.type == "cpu" else together
     found = reconstruct_targets(how, targets, thresholds, out, together)
     results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
-    print(table(results))
     if any(each.verdict != "failed" for each in results):
-        print(f"\nmeshes and codes: {out}")
+        print(f"{table(results)}\n\nmeshes and codes: {out}")
+    else:
+        leave_no_empty_folder(out)
     for each in results:
         if each.verdict == "failed":
             print(f"sdfhub: error: {each.reason}", file=sys.stderr)

@@ -41,6 +41,12 @@ def refuse_unwritable(folder: Path) -> None:
         raise SdfhubError(f"{folder}: cannot be written ({(error.strerror or '').lower()})") from error
 
 
+def leave_no_empty_folder(folder: Path) -> None:
+    """Removes the folder of results that never came."""
+    if folder.is_dir() and not any(folder.iterdir()) and folder.resolve() != Path.cwd():
+        folder.rmdir()
+
+
 def begin_run(
     run: Path,
     config: dict[str, Any],

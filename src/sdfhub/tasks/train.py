@@ -31,6 +31,7 @@ from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
     begin_run,
     build_autodecoder,
+    leave_no_empty_folder,
     put_weights,
     read_run,
     read_weights,
@@ -198,12 +199,6 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     except (ValueError, TypeError, MisconfigurationException) as error:
         hint = "; trainer=auto takes what this machine has" if "ccelerator" in str(error) else ""
         raise SdfhubError(f"trainer: {error}{hint}") from error
-
-
-def leave_no_empty_folder(folder: Path) -> None:
-    """Removes what Hydra made for a run that never began."""
-    if folder.is_dir() and not any(folder.iterdir()) and folder.resolve() != Path.cwd():
-        folder.rmdir()
 
 
 def main() -> None:

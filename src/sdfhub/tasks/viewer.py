@@ -24,6 +24,12 @@ DIRECTIONS, REACH = 6, 3.0
 RUNGS = (64, 128)
 """Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
 
+FAR = 0.03
+"""Mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves."""
+
+STRANGE = 3.0
+"""Times as unusual as the most unusual of the space's own codes: no shape of its kind."""
+
 MEAN = "(mean of all shapes)"
 EYE_AND_AIM = [[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]]
 """Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
@@ -91,11 +97,8 @@ class Viewer:
                 raise SdfhubError(f"{name}: empty, larger than {MAX_UPLOAD >> 20} MiB or of another type")
             self._say(f"Fitting {name} …")
             code, surface = fit_scan(self.space, name, content)
-            with torch.no_grad():
-                off = float(self.space.sdf(surface, code).abs().mean())
-            self._say(
-                f"{name}: the scan's surface is {off:.4f} off the fitted one, on average of a size of 2."
-            )
+            self._say(f"{name}: {self._judged(code, surface)}")
+            self.name.content = told(name, "name") + told("meshing …", "small")
             self.shapes[name], self.scans[name] = code, surface
             self.a.options = self.b.options = tuple(self.shapes)
             self.a.value = name
@@ -104,6 +107,17 @@ class Viewer:
             self._say(f"{error}", is_wrong=True)
         finally:
             self._fitting.release()
+
+    def _judged(self, code: Tensor, surface: np.ndarray) -> str:
+        """How well a code fits the points of a scan's surface, and whether it is one of this space."""
+        with torch.no_grad():
+            off = float(self.space.sdf(surface, code).abs().mean())
+        said = f"the scan's surface is {off:.4f} off the fitted one, on average of a size of 2."
+        if off > FAR:
+            return f"{said} Doubtful: that is far."
+        if self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max():
+            return f"{said} Doubtful: its code is unlike those of this space's shapes."
+        return said
 
     def _draw(self, found: Meshed | SdfhubError) -> None:
         if isinstance(found, SdfhubError):
