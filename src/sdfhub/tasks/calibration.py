@@ -152,8 +152,8 @@ def calibrated(
     Raises:
         SdfhubError: the run's data cannot be had here, or it has too few unseen shapes.
     """
-    key, kept = _digest(run, settings), _read(run / FILE)
-    known = kept.get(key, {})
+    key = _digest(run, settings)
+    known = _read(run / FILE).get(key, {})
     missing = [each for each in kinds if "threshold" not in known.get(str(each), {})]
     shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
     for each in missing:
@@ -161,7 +161,8 @@ def calibrated(
         targets = [each.target(shape, fitter.evidence) for shape in shapes]
         doubts = fitter.doubts(targets)
         entry = {"threshold": calibration.threshold(doubts), "doubts": doubts.tolist()}
-        known[str(each)] = entry | {"shapes": [shape.id for shape in shapes]}
+        kept = _read(run / FILE)  # again: another process may have added to it meanwhile
+        known = kept.get(key, {}) | known | {str(each): entry | {"shapes": [shape.id for shape in shapes]}}
         write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
     return {each: float(known[str(each)]["threshold"]) for each in kinds}
 
