@@ -53,6 +53,8 @@ def test_an_exported_function_is_the_decoder_for_any_number_of_shapes_and_points
     module = torch.export.load(io.BytesIO(function_file(function, "torch_export"))).module()
     ort = pytest.importorskip("onnxruntime")
     session = ort.InferenceSession(function_file(function, "onnx"))
+    axes = {part.name: part.shape for part in (*session.get_inputs(), *session.get_outputs())}
+    assert axes["points"] == ["B", "N", 3] and axes["codes"][0] == "B" and axes["sdf"] == ["B", "N"]
     for shapes, count in ((1, 1), (3, 70), (2, 5)):
         points, codes = torch.rand(shapes, count, 3) * 2 - 1, torch.randn(shapes, 4)
         wanted = decoder(points, codes)

@@ -93,7 +93,18 @@ def function_file(function: torch.export.ExportedProgram, kind: Literal["onnx", 
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
         names = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
         made = torch.onnx.export(function, **names, dynamo=True, verbose=False)
-        return made.model_proto.SerializeToString()
+        return _with_named_axes(made.model_proto).SerializeToString()
+
+
+def _with_named_axes(model: Any) -> Any:
+    """An ONNX model whose free axes are called B and N, where PyTorch's exporter numbers them."""
+    graph = model.graph
+    batch, points = (axis.dim_param for axis in graph.input[0].type.tensor_type.shape.dim[:2])
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        for axis in value.type.tensor_type.shape.dim:
+            if axis.dim_param in (batch, points):
+                axis.dim_param = {batch: "B", points: "N"}[axis.dim_param]
+    return model
 
 
 @contextmanager
