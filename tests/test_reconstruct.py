@@ -82,7 +82,8 @@ def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path
         said = json.loads((tmp_path / f"{name}.json").read_text())
         assert len(said["code"]) == 4 and said["residual"] < 0.02 and said["mesh"] == f"{name}.ply"
         assert said["frame"][3] == [0, 0, 0, 1]
-    assert sorted(path.name for path in tmp_path.iterdir() if "broken" in path.name) == []
+    assert [path.name for path in tmp_path.iterdir() if "broken" in path.name] == ["broken.json"]
+    assert "broken.xyz" in json.loads((tmp_path / "broken.json").read_text())["reason"]
 
 
 def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):

@@ -110,6 +110,15 @@ def test_a_fit_to_the_surface_of_an_unseen_ball_finds_its_field(space, oriented)
     assert space.sdf(0.475 * normals, code).abs().mean() < 0.015
 
 
+def test_a_cloud_of_any_size_and_place_is_fitted_by_its_own_box(space):
+    normals = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+    box = normals.amax(0) - normals.amin(0)
+    normalised = (normals - (normals.amax(0) + normals.amin(0)) / 2) / 1.03
+    far = space.fit(points=50 * normals + 7, normals=normals, frame="shape")
+    assert (box - 2).abs().max() < 0.02
+    torch.testing.assert_close(far, space.fit(points=normalised, normals=normals), rtol=0, atol=0.05)
+
+
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (64, 3))
 
 
@@ -121,7 +130,8 @@ POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (64, 3))
         ({"points": POINTS, "sdf": np.zeros(4)}, r"\[64\] numbers, they are \[4\]"),
         ({"points": POINTS, "sdf": np.ones(64)}, "one side"),
         ({"points": POINTS * np.nan}, "not finite"),
-        ({"points": POINTS * 20}, "from the origin"),
+        ({"points": POINTS * 20}, "fit: reaches .* from the origin"),
+        ({"points": POINTS * 1e-6 + 0.5}, "in one place"),
         ({"points": POINTS, "sdf": POINTS[:, 0], "normals": POINTS}, "not both"),
     ],
 )

@@ -44,7 +44,7 @@ Shape = str | int | Array
 """An id, a row of the code table, or a code [L]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Space:
     """A decoder, the codes of the shapes it was trained on, and what is known of them.
 
@@ -69,6 +69,9 @@ class Space:
     metrics: dict[str, Any] | None
     evidence: Evidence
     method: MapFit
+
+    def __repr__(self) -> str:
+        return f"Space({len(self.ids)} shapes, codes of {self.codes.shape[1]} numbers, {self.up} up)"
 
     def __post_init__(self):
         for id in self.ids:
@@ -165,14 +168,20 @@ class Space:
             yield self.frame(shape).to_source(vertices), faces
 
     def fit(
-        self, points: Array, normals: Array | None = None, sdf: Array | None = None, seed: int = 0
+        self,
+        points: Array,
+        normals: Array | None = None,
+        sdf: Array | None = None,
+        frame: Literal["shape", "normalised"] = "normalised",
+        seed: int = 0,
     ) -> Tensor:
         """The code [L] of a shape that the space has not seen, by MAP estimation.
 
         Args:
-            points: [N, 3], normalised frame: all over the surface where `sdf` is not given.
+            points: [N, 3]: all over the surface where `sdf` is not given.
             normals: [N, 3] outward normals of surface points.
             sdf: [N] signed distances at the points, negative inside, of both sides.
+            frame: of surface points: normalised, or shape, where their own bounding box tells it.
             seed: of the choice of points.
 
         Raises:
@@ -184,7 +193,10 @@ class Space:
             scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
         except ValueError as error:
             raise SdfhubError(f"fit: {error}") from error
-        return self.fit_scan(scan, "normalised", seed)
+        try:
+            return self.fit_scan(scan, frame, seed)
+        except SdfhubError as error:
+            raise SdfhubError(f"fit: {error}") from error
 
     def fit_scan(self, scan: Scan, frame: Literal["shape", "normalised"], seed: int = 0) -> Tensor:
         """The code [L] of a scanned shape, whose frame its own bounding box tells or is the normalised one.

@@ -68,6 +68,8 @@ def observed(scan: Scan, evidence: Evidence, frame: Frame, rng: np.random.Genera
     if not SMALLEST <= reach <= (2.5 if scan.sdf is not None else LARGEST):
         what = "signed samples belong there" if scan.sdf is not None else "give frame=shape if it is whole"
         raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {what}")
+    if np.ptp(points, axis=0).max() < SMALLEST:
+        raise SdfhubError("its points all lie in one place")
     if scan.sdf is not None:
         observation = evidence.of_samples(points, scan.sdf, rng)
         center, scale = (scan.center, scan.scale) if scan.center is not None else (center, scale)

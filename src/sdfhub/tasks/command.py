@@ -11,7 +11,7 @@ TASKS = {
     "export": "one file of a space, or its meshes: sdfhub export run=RUN to=safetensors",
     "interpolate": "shapes between two: sdfhub interpolate run=RUN a=ID b=ID steps=8",
     "sample": "new shapes of a space: sdfhub sample run=RUN n=8",
-    "neighbours": "the shapes most like one: sdfhub neighbours run=RUN of=ID",
+    "neighbours": "the shapes most like one: sdfhub neighbours run=RUN of=ID (or of=scan.ply)",
     "view": "a page on this machine to see, move, mix and fit shapes: sdfhub view run=RUN",
     "import-deepsdf": "an experiment of DeepSDF's code becomes a run: sdfhub import-deepsdf EXPERIMENT_DIR",
     "reconstruct": "finds the shapes behind scans: sdfhub reconstruct run=RUN target=scan.ply",
@@ -23,7 +23,7 @@ def main() -> None:
     """Runs the task that the first argument names with the rest of the command line."""
     task = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if task in ("-h", "--help"):
-        print("usage: sdfhub TASK [key=value ...]\n")
+        print("usage: sdfhub TASK [key=value ...]; sdfhub TASK --help tells its keys\n")
         print("\n".join(f"  {name:<16}{about}" for name, about in TASKS.items()))
         return
     if task not in TASKS:

@@ -17,7 +17,7 @@ from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, calibrated
 from sdfhub.tasks.opening import beside, load
-from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table
+from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table, write_found
 from sdfhub.tasks.run import leave_no_empty_folder, read_run, refuse_unwritable
 
 
@@ -114,6 +114,8 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
         leave_no_empty_folder(out)
     for each in results:
         if each.verdict == "failed":
+            if out.is_dir():  # others were found
+                write_found(each, out)
             print(f"sdfhub: error: {each.reason}", file=sys.stderr)
     return results
 

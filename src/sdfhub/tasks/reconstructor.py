@@ -203,15 +203,21 @@ def _write(found: Found, mesh: Mesh, out: Path) -> None:
     """The mesh first, what is said of it last."""
     if found.mesh:
         write_mesh(*mesh, out / found.mesh)
+    write_found(found, out)
+
+
+def write_found(found: Found, out: Path) -> None:
+    """What was found of a scan, or why nothing was, as NAME.json."""
     write_whole(out / f"{found.name}.json", json.dumps(asdict(found), indent=1))
 
 
 def table(results: Sequence[Found]) -> str:
     """A line a scan: verdict, residual, doubt and its threshold, each times 10^3, what it was judged as."""
     width = max(len("scan"), *(len(each.name) for each in results)) + 2
-    lines = [f"{'scan':<{width}}{'verdict':<10}{'residual x10^3':>15}{'doubt':>9}{'at most':>9}  judged as"]
+    head = f"{'residual':>10}{'doubt':>9}{'at most':>9}  judged as (numbers times 10^3)"
+    lines = [f"{'scan':<{width}}{'verdict':<10}{head}"]
     for each in results:
-        numbers = ((each.residual, 15), (each.doubt, 9), (each.threshold, 9))
+        numbers = ((each.residual, 10), (each.doubt, 9), (each.threshold, 9))
         cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
         why = f"; {each.reason}" if each.reason and each.verdict != "failed" else ""
         lines.append(f"{each.name:<{width}}{each.verdict:<10}{''.join(cells)}  {each.kind}{why}")
