@@ -86,6 +86,18 @@ def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path
     assert "broken.xyz" in json.loads((tmp_path / "broken.json").read_text())["reason"]
 
 
+def test_a_scan_that_fails_later_leaves_what_was_found_of_it(run, scans, tmp_path):
+    common = f"out={tmp_path / 'found'}", "calibration.shapes=0"
+    (tmp_path / "bare.npy").write_bytes((scans / "bare.npy").read_bytes())
+    both = f"target=[{tmp_path / 'bare.npy'},{scans / 'oriented.npz'}]"
+    reconstructed(run, both, *common)
+    before = (tmp_path / "found" / "bare.json").read_bytes()
+    (tmp_path / "bare.npy").unlink()
+    verdicts = {each.name: each.verdict for each in reconstructed(run, both, *common)}
+    assert verdicts == {"bare": "failed", "oriented": "unjudged"}
+    assert (tmp_path / "found" / "bare.json").read_bytes() == before
+
+
 def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):
     common = f"out={tmp_path}", "calibration.shapes=0"
     all_of, alone = (reconstructed(run, f"target={at}", *common) for at in (scans, scans / "bare.npy"))

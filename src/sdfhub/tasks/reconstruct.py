@@ -108,15 +108,16 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     together = 1 if how.space.device.type == "cpu" else together
     found = reconstruct_targets(how, targets, thresholds, out, together)
     results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
-    if any(each.verdict != "failed" for each in results):
+    failed = [each for each in results if each.verdict == "failed"]
+    if len(failed) < len(results):
         print(f"{table(results)}\n\nmeshes and codes: {out}")
     else:
         leave_no_empty_folder(out)
-    for each in results:
-        if each.verdict == "failed":
-            if out.is_dir():  # others were found
-                write_found(each, out)
-            print(f"sdfhub: error: {each.reason}", file=sys.stderr)
+    for each in failed:
+        # what an earlier command found of a scan of this name stays
+        if len(failed) < len(results) and not (out / f"{each.name}.json").exists():
+            write_found(each, out)
+        print(f"sdfhub: error: {each.reason}", file=sys.stderr)
     return results
 
 
