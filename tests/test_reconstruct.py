@@ -142,7 +142,7 @@ def test_scans_are_judged_by_scans_like_them():
     evidence = task.build(composed("run=-", "target=-", config_name="reconstruct")["evidence"], "evidence")
     away = np.random.default_rng(0).standard_normal((3000, 3))
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    for noise, level in ((0.0, 0.0), (0.011, 0.01)):
+    for noise, level in ((0.0, 0.0), (0.012, 0.014), (0.03, 0.028)):
         points = away * (0.6 + noise * np.random.default_rng(1).standard_normal((3000, 1)))
         target = observed(Scan(points), evidence, "normalised", np.random.default_rng(0))
         assert Alike.to(target) == Alike("bare", 4096, level)

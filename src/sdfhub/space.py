@@ -102,7 +102,7 @@ class Space:
                 return self.ids.index(shape)
             near = get_close_matches(shape, self.ids, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.ids[:3])} ..."
-            raise SdfhubError(f"this space has no shape {shape!r}; {hint}")
+            raise SdfhubError(f"this space was not trained on a shape {shape!r}; {hint}")
         if not 0 <= shape < len(self.ids):
             raise SdfhubError(f"this space has no row {shape}; its rows are 0 to {len(self.ids) - 1}")
         return int(shape)
@@ -191,7 +191,7 @@ class Space:
             raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
         try:
             scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise SdfhubError(f"fit: {error}") from error
         try:
             return self.fit_scan(scan, frame, seed)
@@ -251,7 +251,10 @@ class Space:
         return self.distribution.sample(n, seed)
 
     def _tensor(self, array: Array) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+        try:
+            return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise SdfhubError(f"expected an array or tensor of numbers, got {array!r:.60}") from error
 
 
 def _numbers(array: Array | None) -> np.ndarray | None:
@@ -269,8 +272,8 @@ def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Me
     Yields:
         vertices [V, 3], normalised frame, and faces [F, 3].
     """
-    if resolution < 2:
-        raise SdfhubError(f"resolution={resolution}: must be at least 2")
+    if not isinstance(resolution, int | np.integer) or resolution < 2:
+        raise SdfhubError(f"resolution={resolution}: must be a whole number, at least 2")
 
     def fields(points: Tensor, shapes: Tensor) -> Tensor:
         return decoder(points, codes[shapes])

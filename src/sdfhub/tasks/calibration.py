@@ -25,11 +25,15 @@ from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
-NOISES = (0.0, 0.005, 0.01, 0.02)
+RULE = "residual * (1 + unusual)^2"
+"""What a doubt is: kept beside the settings, so that thresholds of another rule are not taken for these."""
+NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
 """Levels of noise that are calibrated apart, normalised frame."""
 DISTANCE, HEIGHT = 2.5, 0.5
 """Of simulated sensors from the origin, and how far up they may stand, as a sine."""
 PIXELS = 100
+VIEWS = 2
+"""Simulated of each shape: what one leaves depends on where the sensor stood."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class Alike:
         """What a target is like."""
         if target.kind == "samples":
             return cls("samples", 0, 0.0)
-        noise = min(NOISES, key=lambda level: abs(level - target.observation.noise))
+        least = 0.95 * target.observation.noise  # what is noisier leaves more
+        noise = next((level for level in NOISES if level >= least), NOISES[-1])
         power = np.clip(round(np.log2(target.count)), 6, 16)
         return cls(target.kind, 0 if target.kind == "view" else int(2**power), noise)
 
@@ -84,17 +89,23 @@ class Alike:
         count = f", {self.count} points" if self.count else ""
         return f"{self.kind}{count}" + (f", noise {self.noise:g}" if self.noise else "")
 
-    def target(self, shape: StoredShape, evidence: Evidence) -> Target:
-        """A simulated scan of a shape, in the normalised frame, observed."""
-        return observed(self.scan(shape), evidence, "normalised", np.random.default_rng(shape_seed(shape)))
+    def targets(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[Target]:
+        """Simulated scans of shapes, observed: one of each, several where each is but a view."""
+        again = range(VIEWS if self.kind == "view" else 1)
+        return [self.target(shape, evidence, number) for shape in shapes for number in again]
 
-    def scan(self, shape: StoredShape) -> Scan:
-        """A simulated scan of a shape, in the normalised frame.
+    def target(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> Target:
+        """A simulated scan of a shape, in the normalised frame, observed; another number gives another scan."""
+        rng = np.random.default_rng([shape_seed(shape), number])
+        return observed(self.scan(shape, number), evidence, "normalised", rng)
+
+    def scan(self, shape: StoredShape, number: int = 0) -> Scan:
+        """A simulated scan of a shape, in the normalised frame; another number gives another one.
 
         Raises:
             SdfhubError: the shape has no mesh to be scanned.
         """
-        rng = np.random.default_rng(shape_seed(shape))
+        rng = np.random.default_rng([shape_seed(shape), number])
         if self.kind == "samples":
             rows = np.concatenate([shape.outside, shape.inside]).astype(np.float64)
             return Scan(rows[:, :3], sdf=rows[:, 3])
@@ -158,8 +169,7 @@ def calibrated(
     shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
     for each in missing:
         print(f"calibration: {each}: fits {len(shapes)} unseen shapes, once", flush=True)
-        targets = [each.target(shape, fitter.evidence) for shape in shapes]
-        doubts = fitter.doubts(targets)
+        doubts = fitter.doubts(each.targets(shapes, fitter.evidence))
         entry = {"threshold": calibration.threshold(doubts), "doubts": doubts.tolist()}
         kept = _read(run / FILE)  # again: another process may have added to it meanwhile
         known = kept.get(key, {}) | known | {str(each): entry | {"shapes": [shape.id for shape in shapes]}}
@@ -189,7 +199,7 @@ def unseen_shapes(
 def _digest(run: Path, settings: dict[str, Any]) -> str:
     """What a run's weights and the settings of a fit are told apart by."""
     weights = file_sha256(run / "checkpoints" / "last.ckpt")
-    text = json.dumps([weights, settings], sort_keys=True)
+    text = json.dumps([weights, settings, RULE, VIEWS], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
