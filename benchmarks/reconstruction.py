@@ -64,7 +64,7 @@ SEEN = 0.02
 def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     source = ProceduralSource({"lamps": {}})
     preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
-    chosen = Split([], split(source.shapes(), 0, count, seed=2).test)
+    chosen = Split([], split(source.shapes(), 0, count, seed=3).test)
     return stored_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
 
 

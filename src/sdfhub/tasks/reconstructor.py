@@ -78,11 +78,11 @@ class Reconstructor:
         return np.array([float(self.doubts_about(self.fit([each]))) for each in bar])
 
     def doubts_about(self, fitted: Fitted) -> Tensor:
-        """[B] residuals, each times the square of one plus how unusual its code is.
+        """[B] residuals, each times the fourth power of one plus how unusual its code is.
 
         A space can bend to a stranger: little is left then, but the code lies where none of its own do.
         """
-        return fitted.residuals * (1 + self.likely.unusual(fitted.codes)).square()
+        return fitted.residuals * (1 + self.likely.unusual(fitted.codes)) ** 4
 
     def meshes(self, targets: Sequence[Target], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
         """Meshes in the targets' own frames, and the matrices [4, 4] from the normalised frame to these."""
@@ -109,7 +109,7 @@ class Found:
         name: of its files.
         kind: what it was judged as; empty where it failed.
         residual: mean violation of the scan's bounds, normalised units.
-        doubt: the same times the square of one plus how unusual its code is.
+        doubt: the same times the fourth power of one plus how unusual its code is.
         threshold: doubt above which the fit is doubtful; None where nothing was calibrated.
         verdict: fitted, doubtful, unjudged (not calibrated) or failed.
         reason: of a verdict other than fitted.
