@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
+from functools import partial
 
 import pytest
 import torch
@@ -119,6 +120,31 @@ def test_the_loops_gradient_can_be_differentiated_again():
     fast, plain = bent(activation.shifted(product, shift)), bent(activation(product + shift))
     for have, want in zip(fast, plain, strict=True):
         torch.testing.assert_close(have, want, rtol=1e-3, atol=1e-2)
+
+
+def test_under_autocast_places_keep_their_digits():
+    decoder = small_decoder(partial(Siren, 100.0, 3.0))
+    points, codes = torch.rand(2, 300, 3), torch.rand(2, 4)
+    exact, gradient = decoder.value_and_gradient(points, codes)
+    with torch.autocast("cpu", torch.bfloat16):
+        near, near_gradient = decoder.value_and_gradient(points, codes)
+    assert near.dtype == torch.float32 and not torch.equal(near, exact)
+    for have, want in ((near, exact), (near_gradient, gradient)):
+        assert (have - want).square().mean() < 0.02**2 * want.square().mean()
+
+
+def test_under_autocast_an_activation_of_float32_gives_bfloat16():
+    activation, (product, shift) = Hosc(5.0, 3.0, 2.0), products()
+    with torch.autocast("cpu", torch.bfloat16):
+        value, slope = activation.shifted_with_slope(product, shift)
+    exact, exact_slope = activation.with_slope(product + shift)
+    assert torch.equal(value, activation.shifted(product, shift).bfloat16())
+    torch.testing.assert_close(slope.float(), exact_slope, rtol=2**-8, atol=1e-4)
+    have = torch.autograd.grad(value.float().sum() + slope.float().sum(), [product, shift, activation.log_beta])
+    want = torch.autograd.grad(exact.sum() + exact_slope.sum(), [product, shift, activation.log_beta])
+    for one, other in zip(have, want, strict=True):
+        assert one.dtype == torch.float32
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-2)
 
 
 def test_bfloat16_products_are_worked_out_in_float32():

@@ -42,7 +42,10 @@ class Layer(nn.Module):
         if self.columns[2]:
             with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
                 shift = F.linear(codes, from_code, self.linear.bias)[:, None]
-        return F.linear(inputs, from_points), shift
+        if self.columns[0]:
+            return F.linear(inputs, from_points), shift
+        with torch.autocast(inputs.device.type, enabled=False):  # a place deserves all its digits too
+            return F.linear(inputs, from_points), shift
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's.

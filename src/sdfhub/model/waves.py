@@ -55,7 +55,7 @@ class Wave(torch.autograd.Function):
         with_slope: whether a' is returned too.
 
     Returns:
-        [B, N, W + F] with the dtype of `product`, and a' [B, N, W] where asked for.
+        [B, N, W + F] with the dtype of `product`, or of autocast, and a' [B, N, W] where asked for.
     """
 
     @staticmethod
@@ -63,9 +63,11 @@ class Wave(torch.autograd.Function):
         ctx.omega, ctx.plain, ctx.with_slope = omega, plain, with_slope
         ctx.save_for_backward(product, shift, log_beta)
         shapes, points, width = product.shape
-        value = product.new_empty(shapes, points, width + (0 if beside is None else beside.shape[2]))
-        slope = product.new_empty(product.shape) if with_slope else None
-        to_copy = None if beside is None else _flat(beside.to(product.dtype))
+        both = width + (0 if beside is None else beside.shape[2])
+        dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else product.dtype
+        value = product.new_empty(shapes, points, both, dtype=dtype)
+        slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
+        to_copy = None if beside is None else _flat(beside.to(dtype))
         results = _flat(value), _flat(slope) if with_slope else None
         _with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
         return (value, slope) if with_slope else value
@@ -192,9 +194,9 @@ def _forward(product, shift, points, omega, beta, beside, value, slope):
                 if beta is not None:
                     a = _tanh(beta * sine)
                     d = beta * d * (_f(1) - a * a)
-                value[p, j] = _narrowed(a, product[p, j])
+                value[p, j] = _narrowed(a, value[p, j])
                 if slope is not None:
-                    slope[p, j] = _narrowed(d, product[p, j])
+                    slope[p, j] = _narrowed(d, slope[p, j])
             if beside is not None:
                 for j in range(beside.shape[1]):
                     value[p, product.shape[1] + j] = beside[p, j]
@@ -228,5 +230,5 @@ def _backward(product, shift, points, omega, beta, by_value, by_slope, by_produc
                         by_v, bent = d * _widened(by_slope[p, j]), _f(2) * a * v
                         by_x -= by_v * (bent * v + omega * omega * u)
                         by_log_beta[chunk, j] += by_v * (v - bent * u)
-                by_product[p, j] = _narrowed(by_x, product[p, j])
+                by_product[p, j] = _narrowed(by_x, by_product[p, j])
                 by_shift[chunk, j] += by_x
