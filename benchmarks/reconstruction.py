@@ -40,9 +40,9 @@ from sdfhub.geometry.metrics import judge, point_to_surface, sample_surface
 from sdfhub.geometry.render import render
 from sdfhub.tasks.app import configuration_folder, register_resolvers
 from sdfhub.tasks.build import build, plain
-from sdfhub.tasks.calibration import Alike, unseen_shapes
+from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
 from sdfhub.tasks.prepare import stored_split
-from sdfhub.tasks.reconstruct import reconstructor, thresholds_of
+from sdfhub.tasks.reconstruct import limits_of, reconstructor
 from sdfhub.tasks.reconstructor import Found, Reconstructor
 from sdfhub.tasks.run import read_run
 
@@ -64,7 +64,7 @@ SEEN = 0.02
 def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     source = ProceduralSource({"lamps": {}})
     preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
-    chosen = Split([], split(source.shapes(), 0, count, seed=3).test)
+    chosen = Split([], split(source.shapes(), 0, count, seed=4).test)
     return stored_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
 
 
@@ -100,19 +100,20 @@ def targets_of(
 
 def fit_all(
     how: Reconstructor, kind: Alike, shapes: list[StoredShape]
-) -> tuple[list[tuple[Mesh, float]], float]:
-    """Mesh of each shape, in the normalised frame, and doubt about it, and processor seconds a fit."""
+) -> tuple[list[Mesh], list[Found], float]:
+    """Mesh of each shape, in the normalised frame, residual and doubt, and processor seconds a fit."""
     targets, matrices = targets_of(how, kind, shapes)
-    found, seconds = [], 0.0
+    meshes, found, seconds = [], [], 0.0
     for target, matrix in zip(targets, matrices, strict=True):
         start = time.process_time()
         fitted = how.fit([target])
         seconds += time.process_time() - start
         (vertices, faces), _ = next(how.meshes([target], fitted))
         near = how.poses is None or bool(how.poses.holds(fitted.poses))
-        doubt = float(how.doubts_about(fitted)) if near else np.inf
-        found.append(((applied(matrix, vertices), faces), doubt))
-    return found, seconds / max(1, len(targets))
+        meshes.append((applied(matrix, vertices), faces))
+        doubt = float(how.doubts(fitted)) if near else np.inf
+        found.append(Found("", residual=float(fitted.residuals), doubt=doubt, mesh="m"))
+    return meshes, found, seconds / max(1, len(targets))
 
 
 def excesses(shapes: list[StoredShape], meshes: list[Mesh]) -> np.ndarray:
@@ -120,8 +121,12 @@ def excesses(shapes: list[StoredShape], meshes: list[Mesh]) -> np.ndarray:
     return np.array([np.nan if each is None else each * 1e3 for each in found])
 
 
-def right_verdicts(doubts: list[float], threshold: float | None, wanted: str) -> str:
-    given = [Found("", doubt=each, mesh="m").judged(threshold, True).verdict for each in doubts]
+def judged(found: list[Found]) -> list[tuple[float, float]]:
+    return [(each.residual, each.doubt) for each in found]
+
+
+def right_verdicts(found: list[Found], limits: Limits | None, wanted: str) -> str:
+    given = [each.judged(limits, True).verdict for each in found]
     return f"{given.count(wanted)}/{len(given)}"
 
 
@@ -181,17 +186,16 @@ def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
     for name in arguments.kinds:
         kind, config = KINDS[name], turned if "turned" in name else still
         how = reconstructor(run, config)
-        threshold = thresholds_of(run, how, [kind], config).get(kind)
-        own, seconds = fit_all(how, kind, shapes)
-        others, _ = fit_all(how, kind, strangers)
-        meshes, doubts, strange = [m for m, _ in own], [r for _, r in own], [r for _, r in others]
+        limits = limits_of(run, how, [kind], config).get(kind)
+        meshes, own, seconds = fit_all(how, kind, shapes)
+        _, others, _ = fit_all(how, kind, strangers)
         excess = excesses(shapes, meshes)
         base = np.nanmedian(excess) if name == "samples" else base
-        right = right_verdicts(doubts, threshold, "fitted"), right_verdicts(strange, threshold, "doubtful")
+        right = right_verdicts(own, limits, "fitted"), right_verdicts(others, limits, "doubtful")
         row(name, excess, base, seconds, *right)
-        lists = {"excess": excess, "doubts": doubts, "strangers": strange}
+        lists = {"excess": excess, "own": judged(own), "strangers": judged(others)}
         said = "; ".join(f"{key} {np.round(values, 5).tolist()}" for key, values in lists.items())
-        print(f"{name}: threshold {threshold}; {said}", file=sys.stderr, flush=True)
+        print(f"{name}: {limits}; {said}", file=sys.stderr, flush=True)
         if "view" in name:
             print(f"\n{name}, true surface to reconstruction: {view_line(shapes, kind, meshes)}\n")
         sheet[name] = list(map(render_of, meshes))
@@ -211,9 +215,9 @@ def compare_with_deepsdf(
 ) -> None:
     count = arguments.reference
     rival = reconstructor(arguments.space, configured(arguments.space, overrides, "deepsdf"))
-    theirs, seconds = fit_all(rival, kind, shapes[:count])
+    theirs, _, seconds = fit_all(rival, kind, shapes[:count])
     row(f"{kind.kind}, first {count}", excess[:count], base, np.nan)
-    other = excesses(shapes[:count], [mesh for mesh, _ in theirs])
+    other = excesses(shapes[:count], theirs)
     row(f"{kind.kind}, first {count}, DeepSDF's recipe", other, base, seconds)
 
 

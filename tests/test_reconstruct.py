@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from sdfhub.data.scan import Scan
 from sdfhub.data.target import observed
 from sdfhub.tasks import calibration as calibrations
 from sdfhub.tasks import reconstruct as task
-from sdfhub.tasks.calibration import Alike, Calibration
+from sdfhub.tasks.calibration import Alike, Calibration, Limits
+from sdfhub.tasks.reconstructor import Found
 from sdfhub.tasks.run import begin_run, build_autodecoder
 from tests.test_config import composed
 from tests.test_reconstruction import ball
@@ -104,13 +106,13 @@ def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):
     assert [each.code for each in all_of if each.name == "bare"] == [alone[0].code]
 
 
-def test_thresholds_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypatch):
+def test_limits_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypatch):
     """The run's data are chairs, which its space of balls cannot fit: the doubts are large."""
     first = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
     kept = json.loads((run / calibrations.FILE).read_text())
     (entry,) = next(iter(kept.values())).values()
-    assert first[0].verdict == "fitted" and first[0].threshold == entry["threshold"]
-    assert len(entry["doubts"]) == len(entry["shapes"]) == 3
+    assert first[0].verdict == "fitted" and asdict(first[0].limits) == entry["limits"]
+    assert len(entry["residuals"]) == len(entry["doubts"]) == len(entry["shapes"]) == 3
     assert entry["shapes"][:2] == ["chairs/0007", "chairs/0009"], "the held-out ones first"
     assert min(entry["doubts"]) > 3 * first[0].doubt
     monkeypatch.setattr(calibrations, "unseen_shapes", None)  # a second measurement would fail
@@ -127,15 +129,29 @@ def test_without_the_runs_data_there_are_meshes_but_no_verdicts(run, scans, tmp_
     assert found.verdict == "unjudged" and found.mesh and "no such folder" in capsys.readouterr().err
 
 
-def test_a_threshold_lies_above_what_it_was_measured_on():
+def test_a_limit_lies_above_what_it_was_measured_on():
     doubts = np.exp(np.random.default_rng(0).normal(-6, 0.3, 200))
-    threshold = Calibration(shapes=200, spread=2.5, reach=1.5).threshold(doubts)
-    assert (doubts <= threshold).mean() > 0.98 and threshold < 2 * np.exp(-6 + 2.5 * 0.3)
+    limit = Calibration(shapes=200, spread=2.5, reach=1.5).limit(doubts)
+    assert (doubts <= limit).mean() > 0.98 and limit < 2 * np.exp(-6 + 2.5 * 0.3)
 
 
-def test_a_threshold_stays_near_the_worst_however_far_doubts_spread():
+def test_a_limit_stays_near_the_worst_however_far_doubts_spread():
     doubts = np.array([0.001, 0.002, 0.02])
-    assert Calibration(shapes=3, spread=2.5, reach=1.5).threshold(doubts) == pytest.approx(0.03)
+    assert Calibration(shapes=3, spread=2.5, reach=1.5).limit(doubts) == pytest.approx(0.03)
+
+
+def test_neither_a_large_residual_nor_an_unlikely_code_passes():
+    limits, found = Limits(residual=0.01, doubt=0.1), Found("a", residual=0.005, doubt=0.05, mesh="a.ply")
+    assert found.judged(limits, True).verdict == "fitted"
+    for other, reason in (({"residual": 0.02}, "residual is larger"), ({"doubt": 0.2}, "residual and code")):
+        judged = replace(found, **other).judged(limits, True)
+        assert judged.verdict == "doubtful" and reason in judged.reason
+    assert (
+        found.judged(limits, False).verdict
+        == replace(found, mesh=None).judged(limits, True).verdict
+        == "doubtful"
+    )
+    assert replace(found, residual=np.nan).judged(limits, True).verdict == "doubtful"
 
 
 def test_scans_are_judged_by_scans_like_them():

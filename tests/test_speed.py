@@ -140,7 +140,9 @@ def test_under_autocast_an_activation_of_float32_gives_bfloat16():
     exact, exact_slope = activation.with_slope(product + shift)
     assert torch.equal(value, activation.shifted(product, shift).bfloat16())
     torch.testing.assert_close(slope.float(), exact_slope, rtol=2**-8, atol=1e-4)
-    have = torch.autograd.grad(value.float().sum() + slope.float().sum(), [product, shift, activation.log_beta])
+    have = torch.autograd.grad(
+        value.float().sum() + slope.float().sum(), [product, shift, activation.log_beta]
+    )
     want = torch.autograd.grad(exact.sum() + exact_slope.sum(), [product, shift, activation.log_beta])
     for one, other in zip(have, want, strict=True):
         assert one.dtype == torch.float32

@@ -226,9 +226,9 @@ class Space:
         return [(self.ids[row], value) for row, value in found if np.isfinite(value)]
 
     def unusual(self, shape: Shape | Sequence[Shape]) -> Tensor:
-        """How far codes lie from the known ones, [] or [B]: about 1 for these, 10 for those of strangers.
+        """How far codes lie from the middle of the known ones, [] or [B]: about 1 for these.
 
-        The squared Mahalanobis distance over L, by the prior under which shapes are fitted.
+        The squared distance over that of the known ones on average; some 5 to 10 for strangers.
         """
         codes = self.code(shape)
         values = self.method.prior(self.codes).unusual(codes.reshape(-1, codes.shape[-1]))

@@ -1,4 +1,4 @@
-"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, left less doubt.
+"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, left less.
 
 A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
 """
@@ -25,8 +25,8 @@ from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
-RULE = "residual * (1 + unusual)^4"
-"""What a doubt is: kept beside the settings, so that thresholds of another rule are not taken for these."""
+RULE = "residual, residual * (1 + unusual)^4"
+"""What is judged: kept beside the settings, so that limits of another rule are not taken for these."""
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
 """Levels of noise that are calibrated apart, normalised frame."""
 DISTANCE, HEIGHT = 2.5, 0.5
@@ -38,11 +38,11 @@ VIEWS = 2
 
 @dataclass(frozen=True)
 class Calibration:
-    """How thresholds are found.
+    """How limits are found.
 
     Args:
         shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
-        spread: standard deviations that the logarithm of a doubt may lie above the mean of theirs, > 0.
+        spread: standard deviations that a value's logarithm may lie above the mean of theirs, > 0.
         reach: times the largest of theirs, however far theirs spread, > 0.
     """
 
@@ -54,16 +54,24 @@ class Calibration:
         if (self.shapes < 3 and self.shapes != 0) or min(self.spread, self.reach) <= 0:
             raise ValueError("shapes must be at least 3, or 0 for no verdicts; spread and reach positive")
 
-    def threshold(self, doubts: np.ndarray) -> float:
-        """The doubt above which a fit is doubtful, from those [S] about shapes known to be of the kind."""
-        logarithms = np.log(np.maximum(doubts, 1e-12))
+    def limit(self, values: np.ndarray) -> float:
+        """The value above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
+        logarithms = np.log(np.maximum(values, 1e-12))
         usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
-        return float(min(usual, self.reach * np.max(doubts)))
+        return float(min(usual, self.reach * np.max(values)))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What residual and doubt of a fit may be at most, for it not to be doubtful."""
+
+    residual: float
+    doubt: float
 
 
 @dataclass(frozen=True)
 class Alike:
-    """What scans have in common that are judged by one threshold: what can be simulated.
+    """What scans have in common that are judged by the same limits: what can be simulated.
 
     Args:
         kind: samples, oriented, bare or view.
@@ -95,7 +103,7 @@ class Alike:
         return [self.target(shape, evidence, number) for shape in shapes for number in again]
 
     def target(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> Target:
-        """A simulated scan of a shape, in the normalised frame, observed; another number gives another scan."""
+        """A simulated scan of a shape, in the normalised frame, observed; another number gives another."""
         rng = np.random.default_rng([shape_seed(shape), number])
         return observed(self.scan(shape, number), evidence, "normalised", rng)
 
@@ -136,8 +144,8 @@ class Fitter(Protocol):
 
     evidence: Evidence
 
-    def doubts(self, targets: Sequence[Target]) -> np.ndarray:
-        """The doubts [B] about targets."""
+    def judged(self, targets: Sequence[Target]) -> np.ndarray:
+        """Residuals and doubts [B, 2] of targets."""
 
 
 def calibrated(
@@ -149,15 +157,15 @@ def calibrated(
     fitter: Fitter,
     settings: dict[str, Any],
     data: dict[str, Any],
-) -> dict[Alike, float]:
-    """The threshold of each kind of scan: the run's own, or measured now and kept.
+) -> dict[Alike, Limits]:
+    """The limits of each kind of scan: the run's own, or measured now and kept.
 
     Args:
         run: its folder; trained and roles are its config and split.
         calibration: how.
         kinds: that are wanted.
         fitter: fits targets.
-        settings: plain, all that doubts depend on.
+        settings: plain, all that fits depend on.
         data: keys that stand in for the run's own (store, workers).
 
     Raises:
@@ -165,16 +173,17 @@ def calibrated(
     """
     key = _digest(run, settings)
     known = _read(run / FILE).get(key, {})
-    missing = [each for each in kinds if "threshold" not in known.get(str(each), {})]
+    missing = [each for each in kinds if "limits" not in known.get(str(each), {})]
     shapes = unseen_shapes(trained, roles, data, calibration.shapes) if missing else []
     for each in missing:
         print(f"calibration: {each}: fits {len(shapes)} unseen shapes, once", flush=True)
-        doubts = fitter.doubts(each.targets(shapes, fitter.evidence))
-        entry = {"threshold": calibration.threshold(doubts), "doubts": doubts.tolist()}
+        residuals, doubts = fitter.judged(each.targets(shapes, fitter.evidence)).T
+        entry = {"limits": {"residual": calibration.limit(residuals), "doubt": calibration.limit(doubts)}}
+        entry |= {"residuals": residuals.tolist(), "doubts": doubts.tolist()}
         kept = _read(run / FILE)  # again: another process may have added to it meanwhile
         known = kept.get(key, {}) | known | {str(each): entry | {"shapes": [shape.id for shape in shapes]}}
         write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
-    return {each: float(known[str(each)]["threshold"]) for each in kinds}
+    return {each: Limits(**known[str(each)]["limits"]) for each in kinds}
 
 
 def unseen_shapes(

@@ -15,7 +15,7 @@ from sdfhub.data.target import Frame, Target
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.calibration import Alike, calibrated
+from sdfhub.tasks.calibration import Alike, Limits, calibrated
 from sdfhub.tasks.opening import beside, load
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table, write_found
 from sdfhub.tasks.run import leave_no_empty_folder, read_run, refuse_unwritable
@@ -73,10 +73,10 @@ def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
     )
 
 
-def thresholds_of(
+def limits_of(
     run: Path, how: Reconstructor, kinds: Sequence[Alike], config: dict[str, Any]
-) -> dict[Alike, float]:
-    """The thresholds of kinds of scans; none, and a line that says why, where they cannot be had."""
+) -> dict[Alike, Limits]:
+    """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     calibration = build(config["calibration"], "calibration")
     if not calibration.shapes:
         return {}
@@ -104,9 +104,9 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     refuse_unwritable(out)
     targets, results = read_targets(how, files, sensor)
     kinds = list(dict.fromkeys(map(Alike.to, targets.values())))
-    thresholds = thresholds_of(run, how, kinds, config) if targets else {}
+    limits = limits_of(run, how, kinds, config) if targets else {}
     together = 1 if how.space.device.type == "cpu" else together
-    found = reconstruct_targets(how, targets, thresholds, out, together)
+    found = reconstruct_targets(how, targets, limits, out, together)
     results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
     failed = [each for each in results if each.verdict == "failed"]
     if len(failed) < len(results):

@@ -19,7 +19,7 @@ from sdfhub.model.prior import Normal
 from sdfhub.model.reconstruction import Fitted, Method
 from sdfhub.model.similarity import PoseRange
 from sdfhub.space import Space
-from sdfhub.tasks.calibration import Alike
+from sdfhub.tasks.calibration import Alike, Limits
 from sdfhub.tasks.mesh_file import write_mesh
 from sdfhub.whole_file import write_whole
 
@@ -72,12 +72,13 @@ class Reconstructor:
         except ValueError as error:
             raise SdfhubError(f"method: {error}") from error
 
-    def doubts(self, targets: Sequence[Target]) -> np.ndarray:
-        """The doubts [B] about targets whose shapes nobody asked for."""
-        bar = tqdm(targets, desc="calibrating", unit="shape", leave=False, disable=None)
-        return np.array([float(self.doubts_about(self.fit([each]))) for each in bar])
+    def judged(self, targets: Sequence[Target]) -> np.ndarray:
+        """Residuals and doubts [B, 2] of targets whose shapes nobody asked for."""
+        bar = tqdm(targets, desc="calibrating", unit="scan", leave=False, disable=None)
+        fits = (self.fit([each]) for each in bar)
+        return np.array([(float(fitted.residuals), float(self.doubts(fitted))) for fitted in fits])
 
-    def doubts_about(self, fitted: Fitted) -> Tensor:
+    def doubts(self, fitted: Fitted) -> Tensor:
         """[B] residuals, each times the fourth power of one plus how unusual its code is.
 
         A space can bend to a stranger: little is left then, but the code lies where none of its own do.
@@ -110,7 +111,7 @@ class Found:
         kind: what it was judged as; empty where it failed.
         residual: mean violation of the scan's bounds, normalised units.
         doubt: the same times the fourth power of one plus how unusual its code is.
-        threshold: doubt above which the fit is doubtful; None where nothing was calibrated.
+        limits: what these two may be at most; None where nothing was calibrated.
         verdict: fitted, doubtful, unjudged (not calibrated) or failed.
         reason: of a verdict other than fitted.
         code: [L] numbers.
@@ -122,37 +123,39 @@ class Found:
     kind: str = ""
     residual: float | None = None
     doubt: float | None = None
-    threshold: float | None = None
+    limits: Limits | None = None
     verdict: Literal["fitted", "doubtful", "unjudged", "failed"] = "failed"
     reason: str = ""
     code: tuple[float, ...] = ()
     frame: tuple[tuple[float, ...], ...] = ()
     mesh: str | None = None
 
-    def judged(self, threshold: float | None, is_near: bool) -> "Found":
+    def judged(self, limits: Limits | None, is_near: bool) -> "Found":
         """The same with a verdict.
 
         Args:
-            threshold: of doubts about its kind of scan; None where nothing was calibrated.
+            limits: for its kind of scan; None where nothing was calibrated.
             is_near: whether its pose lies within the range of poses.
         """
         if self.mesh is None:
             verdict, reason = "doubtful", "the field has no surface"
         elif not is_near:
             verdict, reason = "doubtful", "its pose lies outside the range of poses"
-        elif threshold is None:
+        elif limits is None:
             verdict, reason = "unjudged", "nothing was calibrated"
-        elif not self.doubt <= threshold:
+        elif not self.residual <= limits.residual:
+            verdict, reason = "doubtful", "its residual is larger than those of this space's shapes"
+        elif not self.doubt <= limits.doubt:
             verdict, reason = "doubtful", "residual and code are unlike those of this space's shapes"
         else:
             verdict, reason = "fitted", ""
-        return replace(self, threshold=threshold, verdict=verdict, reason=reason)
+        return replace(self, limits=limits, verdict=verdict, reason=reason)
 
 
 def reconstruct_targets(
     how: Reconstructor,
     targets: dict[str, Target],
-    thresholds: dict[Alike, float],
+    limits: dict[Alike, Limits],
     out: Path,
     together: int,
 ) -> Iterator[Found]:
@@ -163,7 +166,7 @@ def reconstruct_targets(
     Args:
         how: the space.
         targets: by the names of their files.
-        thresholds: by kind of scan.
+        limits: by kind of scan.
         out: folder.
         together: targets fitted side by side.
     """
@@ -171,17 +174,17 @@ def reconstruct_targets(
     for first in range(0, len(names), together):
         group = names[first : first + together]
         try:
-            yield from _reconstruct_group(how, {name: targets[name] for name in group}, thresholds, out)
+            yield from _reconstruct_group(how, {name: targets[name] for name in group}, limits, out)
         except SdfhubError as error:
             yield from (Found(name, reason=str(error)) for name in group)
 
 
 def _reconstruct_group(
-    how: Reconstructor, group: dict[str, Target], thresholds: dict[Alike, float], out: Path
+    how: Reconstructor, group: dict[str, Target], limits: dict[Alike, Limits], out: Path
 ) -> list[Found]:
     targets, found = list(group.values()), []
     fitted = how.fit(targets)
-    doubts = how.doubts_about(fitted).tolist()
+    doubts = how.doubts(fitted).tolist()
     near = how.poses.holds(fitted.poses).tolist() if fitted.poses else [True] * len(group)
     for row, (mesh, matrix) in enumerate(how.meshes(targets, fitted)):
         name, kind = list(group)[row], Alike.to(targets[row])
@@ -194,7 +197,7 @@ def _reconstruct_group(
             frame=tuple(map(tuple, matrix.tolist())),
             mesh=f"{name}.ply" if len(mesh[1]) else None,
         )
-        found.append(result.judged(thresholds.get(kind), near[row]))
+        found.append(result.judged(limits.get(kind), near[row]))
         _write(found[-1], mesh, out)
     return found
 
@@ -212,12 +215,14 @@ def write_found(found: Found, out: Path) -> None:
 
 
 def table(results: Sequence[Found]) -> str:
-    """A line a scan: verdict, residual, doubt and its threshold, each times 10^3, what it was judged as."""
+    """A line a scan: verdict, residual and doubt beside their limits, times 10^3, what it was judged as."""
     width = max(len("scan"), *(len(each.name) for each in results)) + 2
-    head = f"{'residual':>10}{'doubt':>9}{'at most':>9}  judged as (numbers times 10^3)"
+    head = f"{'residual':>10}{'at most':>9}{'doubt':>11}{'at most':>11}  judged as (numbers times 10^3)"
     lines = [f"{'scan':<{width}}{'verdict':<10}{head}"]
     for each in results:
-        numbers = ((each.residual, 10), (each.doubt, 9), (each.threshold, 9))
+        most = each.limits
+        limits = (most.residual, most.doubt) if most else (None, None)
+        numbers = ((each.residual, 10), (limits[0], 9), (each.doubt, 11), (limits[1], 11))
         cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
         why = f"; {each.reason}" if each.reason and each.verdict != "failed" else ""
         lines.append(f"{each.name:<{width}}{each.verdict:<10}{''.join(cells)}  {each.kind}{why}")

@@ -27,7 +27,7 @@ RUNGS = (64, 128)
 FAR = 0.03
 """Mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves."""
 
-STRANGE = 3.0
+STRANGE = 2.0
 """Times as unusual as the most unusual of the space's own codes: no shape of its kind."""
 
 MEAN = "(mean of all shapes)"
