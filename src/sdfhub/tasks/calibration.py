@@ -25,7 +25,7 @@ from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
-RULE = "residual, residual * (1 + unusual)^4"
+RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
 """What is judged: kept beside the settings, so that limits of another rule are not taken for these."""
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
 """Levels of noise that are calibrated apart, normalised frame."""
