@@ -145,7 +145,7 @@ MISTAKES = [
     (interpolate, ["a=balls/smal", "b=0"], "did you mean 'balls/small'"),
     (interpolate, ["a=0"], "b=...: must be given"),
     (interpolate, ["a=0", "b=1", "step=3"], "did you mean 'steps'"),
-    (interpolate, ["a=0", "b=1", "steps=1"], "steps=1: must be at least 2"),
+    (interpolate, ["a=0", "b=1", "steps=1"], "steps=1: must be a whole number, at least 2"),
     (interpolate, ["a=0", "b=1", "activation=relu"], "the keys are run, a, b, steps"),
     (interpolate, ["a=0", "b=1", "resolution=fine"], "resolution='fine'"),
     (sample, ["n=0"], "n=0"),
@@ -153,7 +153,8 @@ MISTAKES = [
     (neighbours, ["of=9"], "rows are 0 to 3"),
     (export, ["to=stl"], "choose safetensors, onnx, torch_export, meshes"),
     (export, ["to=meshes", "format=stl"], "format='stl'"),
-    (export, ["to=meshes", "shapes=[cube]"], "no shape 'cube'"),
+    (export, ["to=meshes", "shapes=[cube]"], "not trained on a shape 'cube'"),
+    (export, ["to=meshes", "shapes=cube"], "not trained on a shape 'cube'"),
     (export, ["to=meshes", "shapes=[]"], "shapes=[]"),
     (export, ["to=meshes", "resolution=1"], "resolution=1"),
 ]

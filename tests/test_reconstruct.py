@@ -143,7 +143,7 @@ def test_a_limit_stays_near_the_worst_however_far_doubts_spread():
 def test_neither_a_large_residual_nor_an_unlikely_code_passes():
     limits, found = Limits(residual=0.01, doubt=0.1), Found("a", residual=0.005, doubt=0.05, mesh="a.ply")
     assert found.judged(limits, True).verdict == "fitted"
-    for other, reason in (({"residual": 0.02}, "residual is larger"), ({"doubt": 0.2}, "residual and code")):
+    for other, reason in (({"residual": 0.02}, "residual 2.00 x"), ({"doubt": 0.3}, "doubt 3.00 x")):
         judged = replace(found, **other).judged(limits, True)
         assert judged.verdict == "doubtful" and reason in judged.reason
     assert (

@@ -190,7 +190,16 @@ def test_principal_directions_are_orthogonal_and_as_long_as_codes_spread_along_t
         (lambda space: space.mesh("zebra"), "it has balls/small"),
         (lambda space: space.mesh(4), "rows are 0 to 3"),
         (lambda space: space.mesh(-1), "rows are 0 to 3"),
-        (lambda space: space.sdf(on_axis(1), torch.zeros(5)), "a code has 4 numbers"),
+        (lambda space: space.sdf(on_axis(1), torch.zeros(5)), "tensor of 4 numbers; got"),
+        (lambda space: space.sdf(on_axis(1), [0.0] * 4), "tensor of 4 numbers; got"),
+        (lambda space: space.sdf(on_axis(1), []), "no shape is named"),
+        (lambda space: space.sdf(on_axis(1), True), "no row True"),
+        (lambda space: space.mesh(IDS[:2], resolution=8), "expected one shape, got several"),
+        (lambda space: space.interpolate(IDS[:2], 1, 3), "expected one shape, got several"),
+        (lambda space: space.fit(on_axis(1), frame="unknown"), "frame='unknown': must be 'shape'"),
+        (lambda space: space.interpolate(0, 1, 2.5), "steps=2.5: must be a whole number"),
+        (lambda _: sdfhub.load(None), "load takes the path"),
+        (lambda _: sdfhub.prepare_mesh("chair.obj"), "prepare_mesh takes a trimesh.Trimesh"),
         (lambda space: space.sdf(on_axis(1)[None], 0), "of B shapes"),
         (lambda space: space.sdf(torch.zeros(2, 2), 0), "points"),
         (lambda space: space.sdf("abc", 0), "numbers, got 'abc'"),
@@ -205,6 +214,15 @@ def test_principal_directions_are_orthogonal_and_as_long_as_codes_spread_along_t
 def test_a_mistake_is_one_clear_line(space, ask, message):
     with pytest.raises(SdfhubError, match=message):
         ask(space)
+
+
+def test_a_grid_that_does_not_fit_is_one_clear_line(space, monkeypatch):
+    def too_large(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(sdfhub.space, "mesh_fields", too_large)
+    with pytest.raises(SdfhubError, match="resolution=5000: there is not enough memory"):
+        space.mesh(0, resolution=5000)
 
 
 @pytest.mark.parametrize("module", [sdfhub.space, sdfhub.model.distribution])

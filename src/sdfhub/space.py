@@ -103,7 +103,7 @@ class Space:
             near = get_close_matches(shape, self.ids, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.ids[:3])} ..."
             raise SdfhubError(f"this space was not trained on a shape {shape!r}; {hint}")
-        if not 0 <= shape < len(self.ids):
+        if isinstance(shape, bool) or not 0 <= shape < len(self.ids):
             raise SdfhubError(f"this space has no row {shape}; its rows are 0 to {len(self.ids) - 1}")
         return int(shape)
 
@@ -116,10 +116,19 @@ class Space:
         if isinstance(shape, str | int | np.integer):
             return self.codes[self.row(shape)]
         if isinstance(shape, Sequence):
-            return torch.stack([self.code(one) for one in shape])
+            if not shape:
+                raise SdfhubError("no shape is named")
+            return torch.stack([self._code_of_one(one) for one in shape])
         code = self._tensor(shape)
         if code.dim() not in (1, 2) or code.shape[-1] != self.codes.shape[1]:
-            raise SdfhubError(f"a code has {self.codes.shape[1]} numbers, got {list(code.shape)}")
+            what = f"a code is an array or tensor of {self.codes.shape[1]} numbers"
+            raise SdfhubError(f"a shape is an id, a row or a code, and {what}; got {list(code.shape)}")
+        return code
+
+    def _code_of_one(self, shape: Shape) -> Tensor:
+        code = self.code(shape)
+        if code.dim() != 1:
+            raise SdfhubError("expected one shape, got several; meshes, not mesh, takes these")
         return code
 
     def frame(self, shape: Shape) -> Frame:
@@ -159,6 +168,7 @@ class Space:
         Returns:
             vertices [V, 3] float64 and faces [F, 3] int64; V = F = 0 where the field has no zero level.
         """
+        self._code_of_one(shape)  # several would be taken for one
         return next(self.meshes([shape], resolution))
 
     def meshes(self, shapes: Sequence[Shape] | Tensor, resolution: int = 256) -> Iterator[Mesh]:
@@ -189,6 +199,8 @@ class Space:
         """
         if sdf is not None and normals is not None:
             raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
+        if frame not in ("shape", "normalised"):
+            raise SdfhubError(f"fit: frame={frame!r}: must be 'shape' or 'normalised'")
         try:
             scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
         except (TypeError, ValueError) as error:
@@ -209,16 +221,14 @@ class Space:
 
     def interpolate(self, a: Shape, b: Shape, steps: int) -> Tensor:
         """Codes [steps, L] in equal steps along the line from a to b, both included; steps >= 2."""
-        if steps < 2:
-            raise SdfhubError(f"steps={steps}: must be at least 2")
+        _check_count("steps", steps, 2)
         share = torch.linspace(0, 1, steps, device=self.device)[:, None]
-        return torch.lerp(self.code(a)[None], self.code(b)[None], share)
+        return torch.lerp(self._code_of_one(a)[None], self._code_of_one(b)[None], share)
 
     def neighbours(self, shape: Shape, k: int = 5) -> list[tuple[str, float]]:
         """Ids of the k shapes with the nearest codes, and how far they are; a shape is not its own."""
-        if k < 1:
-            raise SdfhubError(f"k={k}: must be at least 1")
-        distances = (self.codes - self.code(shape).detach()).norm(dim=1)
+        _check_count("k", k, 1)
+        distances = (self.codes - self._code_of_one(shape).detach()).norm(dim=1)
         if isinstance(shape, str | int | np.integer):
             distances[self.row(shape)] = torch.inf
         values, rows = distances.topk(min(k, len(self.ids)), largest=False)
@@ -246,8 +256,7 @@ class Space:
 
     def sample(self, n: int, seed: int = 0) -> Tensor:
         """Codes [n, L] of new shapes, drawn from the distribution of the known ones."""
-        if n < 1:
-            raise SdfhubError(f"n={n}: must be at least 1")
+        _check_count("n", n, 1)
         return self.distribution.sample(n, seed)
 
     def _tensor(self, array: Array) -> Tensor:
@@ -255,6 +264,11 @@ class Space:
             return torch.as_tensor(array, dtype=torch.float32, device=self.device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise SdfhubError(f"expected an array or tensor of numbers, got {array!r:.60}") from error
+
+
+def _check_count(name: str, value: int, least: int) -> None:
+    if not isinstance(value, int | np.integer) or value < least:
+        raise SdfhubError(f"{name}={value!r}: must be a whole number, at least {least}")
 
 
 def _numbers(array: Array | None) -> np.ndarray | None:
@@ -272,10 +286,12 @@ def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Me
     Yields:
         vertices [V, 3], normalised frame, and faces [F, 3].
     """
-    if not isinstance(resolution, int | np.integer) or resolution < 2:
-        raise SdfhubError(f"resolution={resolution}: must be a whole number, at least 2")
+    _check_count("resolution", resolution, 2)
 
     def fields(points: Tensor, shapes: Tensor) -> Tensor:
         return decoder(points, codes[shapes])
 
-    return mesh_fields(fields, len(codes), resolution, device=codes.device)
+    try:
+        yield from mesh_fields(fields, len(codes), resolution, device=codes.device)
+    except MemoryError as error:
+        raise SdfhubError(f"resolution={resolution}: there is not enough memory for its grid") from error

@@ -116,7 +116,7 @@ def _utf8(content: bytes) -> bytes:
 
 def _check_triangles(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
     if not faces.size:
-        raise RejectedMesh("no_faces", f"{name} holds no faces; point clouds have no inside")
+        raise RejectedMesh("no_faces", f"{name} holds no faces: a point cloud, not a mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise RejectedMesh("corrupt_file", f"{name} has a face with a vertex that is not there")
     if not np.isfinite(vertices).all():

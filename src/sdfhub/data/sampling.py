@@ -8,7 +8,7 @@ from sdfhub.data.normalize import face_normals, normalize_mesh
 from sdfhub.data.preparation import DEFAULT, Preparation
 from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points
 from sdfhub.data.visibility import Surface, closed_surface, points_on_faces, visible_surface
-from sdfhub.errors import RejectedMesh
+from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
 
 if TYPE_CHECKING:
@@ -38,7 +38,11 @@ def prepare_mesh(
     Raises:
         RejectedMesh: no trustworthy signs can be had; its `reason` names the rule.
     """
-    vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "vertices") else mesh
+    try:
+        vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
+    except (TypeError, ValueError) as error:
+        what = "a trimesh.Trimesh, as trimesh.load_mesh(file) gives it, or its vertices and faces"
+        raise SdfhubError(f"prepare_mesh takes {what}; got {mesh!r:.60}") from error
     normalized = normalize_mesh(vertices, faces, preparation)
     rng = np.random.default_rng(seed)
     surface = closed_surface(normalized) if preparation.sign == "winding" else None

@@ -6,7 +6,7 @@ carries x_i into the normalised frame:
     mean_i huber(v_i) + weight / L * (|z - mean|^2 by the prior's covariance + |T|^2 by the range's)
 
 v_i is how far the clamped f(T x_i, z) lies outside its bounds [low_i, high_i], which grow with T's scale s,
-over s: in the units of the observation. In those of the normalised frame it would pay to shrink what was seen.
+over s: in the observation's units. In those of the normalised frame it would pay to shrink what was seen.
 Source: Park et al. 2019, equation 10, whose samples have equal bounds.
 """
 

@@ -28,7 +28,7 @@ class Fitted(NamedTuple):
 
     Args:
         codes: [B, L].
-        residuals: [B] mean |violation| over all rows, normalised units.
+        residuals: [B] mean |violation| over all rows, in the observations' units.
         poses: from the observations' frames to the normalised one; None where that was known.
     """
 

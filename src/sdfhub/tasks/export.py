@@ -49,7 +49,8 @@ def export(config: dict[str, Any]) -> None:
 def export_meshes(config: dict[str, Any], folder: Path) -> None:
     """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
     suffix = check(config["format"], Literal[FORMATS], "format")
-    chosen = check(config["shapes"], list[str | int] | None, "shapes")
+    chosen = check(config["shapes"], list[str | int] | str | int | None, "shapes")
+    chosen = [chosen] if isinstance(chosen, str | int) else chosen
     resolution = check(config["resolution"], int, "resolution")
     space = load(check(config["run"], str, "run"))
     rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]

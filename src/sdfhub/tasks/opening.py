@@ -44,6 +44,8 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     Raises:
         SdfhubError: nothing usable is there, or not on this machine.
     """
+    if not isinstance(path, str | Path):
+        raise SdfhubError(f"load takes the path of a run or an exported file, got {path!r:.60}")
     path = Path(path)
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")

@@ -1,6 +1,7 @@
 """Task `reconstruct`: the shapes behind scans, found in a trained space, as meshes in the scans' frames."""
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,7 +41,10 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
         named |= {each: each.stem for each in inside}
     if not named:
         raise SdfhubError("target: names no scan")
-    return unique_ids(named)
+    often = Counter(named.values())
+    return unique_ids(
+        {path: stem if often[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
+    )
 
 
 def read_targets(

@@ -140,16 +140,20 @@ class Found:
         if self.mesh is None:
             verdict, reason = "doubtful", "the field has no surface"
         elif not is_near:
-            verdict, reason = "doubtful", "its pose lies outside the range of poses"
+            verdict, reason = "doubtful", "no pose within poses.scale, poses.tilt and poses.shift was found"
         elif limits is None:
             verdict, reason = "unjudged", "nothing was calibrated"
-        elif not self.residual <= limits.residual:
-            verdict, reason = "doubtful", "its residual is larger than those of this space's shapes"
-        elif not self.doubt <= limits.doubt:
-            verdict, reason = "doubtful", "residual and code are unlike those of this space's shapes"
         else:
-            verdict, reason = "fitted", ""
+            reason = self._beyond(limits)
+            verdict = "doubtful" if reason else "fitted"
         return replace(self, limits=limits, verdict=verdict, reason=reason)
+
+    def _beyond(self, limits: Limits) -> str:
+        """How many times residual and doubt are their limits, where they are more; else nothing."""
+        pairs = ("residual", self.residual, limits.residual), ("doubt", self.doubt, limits.doubt)
+        return ", ".join(
+            f"{name} {has / most:.2f} x its limit" for name, has, most in pairs if not has <= most
+        )
 
 
 def reconstruct_targets(
