@@ -73,12 +73,13 @@ def test_the_quadratic_has_the_objectives_value_and_gradient(decoder, poses):  #
     turn = torch.tensor([0 if poses is None else 1])
 
     def objective(at):
-        moved = seen.turned(problem.turns[turn])
+        moved, scale = seen.turned(problem.turns[turn]), 1
         if poses:
             pose = small_similarity(at[:, 4:])
+            scale = pose.scale
             bounds = {name: getattr(moved, name) * pose.scale for name in ("low", "high")}
             moved = moved._replace(points=pose.moved(moved.points), **bounds)
-        size = violation(decoder, at[:, :4], moved, 0.1).abs()
+        size = violation(decoder, at[:, :4], moved, 0.1).abs() / scale
         huber = torch.nn.functional.huber_loss(size, torch.zeros_like(size), delta=0.01) / 0.01
         away = at - problem.center
         return huber + 1e-2 * (away @ problem.precision @ away.mT).sum()
@@ -90,6 +91,15 @@ def test_the_quadratic_has_the_objectives_value_and_gradient(decoder, poses):  #
     assert torch.allclose(about.value, value, atol=1e-6)
     assert torch.allclose(about.gradient, gradient, atol=1e-5)
     assert torch.linalg.eigvalsh(about.hessian).min() > 0
+
+
+def test_it_does_not_pay_to_shrink_what_was_seen(decoder):  # noqa: F811
+    problem, seen = Problem(decoder, GaussianPrior(0.3)(CODES), 0.1, POSES), rows(ball(0.5))
+    small, whole = torch.zeros(2, 1, len(problem.center))
+    small[0, 4] = math.log(0.1)  # of the scale
+    turn = torch.tensor([0])
+    off = [problem.violation_and_jacobian(seen, turn, at)[0].abs().mean() for at in (small, whole)]
+    assert off[0] > off[1]
 
 
 def test_a_fit_finds_balls_from_samples_and_from_surfaces(decoder):  # noqa: F811
