@@ -93,15 +93,6 @@ def test_the_quadratic_has_the_objectives_value_and_gradient(decoder, poses):  #
     assert torch.linalg.eigvalsh(about.hessian).min() > 0
 
 
-def test_it_does_not_pay_to_shrink_what_was_seen(decoder):  # noqa: F811
-    problem, seen = Problem(decoder, GaussianPrior(0.3)(CODES), 0.1, POSES), rows(ball(0.5))
-    small, whole = torch.zeros(2, 1, len(problem.center))
-    small[0, 4] = math.log(0.1)  # of the scale
-    turn = torch.tensor([0])
-    off = [problem.violation_and_jacobian(seen, turn, at)[0].abs().mean() for at in (small, whole)]
-    assert off[0] > off[1]
-
-
 def test_a_fit_finds_balls_from_samples_and_from_surfaces(decoder):  # noqa: F811
     seen = [ball(0.45), ball(0.52), ball(0.48, surface_only=True), ball(0.5, noise=0.01)]
     found = MapFit(**MAP)(decoder, CODES, seen)
