@@ -11,6 +11,7 @@ objective is what the search lowered: the geometric mean of known and held-out s
 
 import argparse
 import csv
+import io
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,10 +52,8 @@ def read_search(folder: Path) -> tuple[list[Trial], Trial | None, list[str]]:
     trials = [trial for trial in found if trial.name != DEFAULTS]
     trials.sort(key=lambda trial: float("inf") if trial.objective is None else trial.objective)
     keys = trials[0].settings if trials else {}
-    searched = [key for key in keys if len({str(trial.settings.get(key)) for trial in trials}) > 1]
-    searched = [
-        key for key in searched if not key.startswith(("decoder.", "scale."))
-    ]  # repeat what they name
+    own = [key for key in keys if not key.startswith(("decoder.", "scale."))]  # these repeat others
+    searched = [key for key in own if len({str(trial.settings.get(key)) for trial in trials}) > 1]
     return trials, next((trial for trial in found if trial.name == DEFAULTS), None), searched
 
 
@@ -69,14 +68,13 @@ def shown(value: Any) -> str:
 
 
 def write_csv(path: Path, searches: dict[str, list[Trial]], keys: list[str]) -> None:
-    with open(path.with_suffix(".part"), "w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(["search", "objective", "seconds", *keys])
-        for name, trials in searches.items():
-            for trial in trials:
-                rows.writerow([name, trial.objective, trial.seconds, *map(trial.settings.get, keys)])
-    write_whole(path, path.with_suffix(".part").read_text(encoding="utf-8"))
-    path.with_suffix(".part").unlink()
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["search", "objective", "seconds", *keys])
+    for name, trials in searches.items():
+        for trial in trials:
+            rows.writerow([name, trial.objective, trial.seconds, *map(trial.settings.get, keys)])
+    write_whole(path, text.getvalue())
 
 
 def main() -> None:

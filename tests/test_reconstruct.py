@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import trimesh
 
 from sdfhub.data.scan import Scan
 from sdfhub.data.target import observed
+from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks import calibration as calibrations
 from sdfhub.tasks import reconstruct as task
 from sdfhub.tasks.calibration import Alike, Calibration, Limits
@@ -152,6 +154,23 @@ def test_neither_a_large_residual_nor_an_unlikely_code_passes():
         == "doubtful"
     )
     assert replace(found, residual=np.nan).judged(limits, True).verdict == "doubtful"
+
+
+def test_of_each_shape_several_views_are_calibrated_and_one_of_any_other_scan():
+    evidence = task.build(composed("run=-", "target=-", config_name="reconstruct")["evidence"], "evidence")
+    box = trimesh.creation.box((0.9, 0.7, 0.5))
+    mesh = NormalizedMesh(np.array(box.vertices), np.array(box.faces), np.zeros(3), 1.0)
+    shapes = [SimpleNamespace(id=id, fingerprint="f", up="z", mesh=mesh) for id in ("a", "b")]
+    views = Alike("view", 0, 0.0).targets(shapes, evidence)
+    assert len(views) == 2 * calibrations.VIEWS == 4
+    assert len({each.observation.points.tobytes() for each in views}) == 4
+    assert len(Alike("bare", 1024, 0.0).targets(shapes, evidence)) == 2
+
+
+def test_limits_of_another_rule_are_not_taken(run, monkeypatch):
+    before = calibrations._digest(run, {"prior": 1})
+    monkeypatch.setattr(calibrations, "RULE", "residual")
+    assert calibrations._digest(run, {"prior": 1}) != before
 
 
 def test_scans_are_judged_by_scans_like_them():

@@ -128,7 +128,7 @@ class Space:
     def _code_of_one(self, shape: Shape) -> Tensor:
         code = self.code(shape)
         if code.dim() != 1:
-            raise SdfhubError("expected one shape, got several; meshes, not mesh, takes these")
+            raise SdfhubError("expected one shape, got several")
         return code
 
     def frame(self, shape: Shape) -> Frame:
@@ -168,7 +168,6 @@ class Space:
         Returns:
             vertices [V, 3] float64 and faces [F, 3] int64; V = F = 0 where the field has no zero level.
         """
-        self._code_of_one(shape)  # several would be taken for one
         return next(self.meshes([shape], resolution))
 
     def meshes(self, shapes: Sequence[Shape] | Tensor, resolution: int = 256) -> Iterator[Mesh]:

@@ -56,7 +56,8 @@ class Calibration:
 
     def limit(self, values: np.ndarray) -> float:
         """The value above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
-        logarithms = np.log(np.maximum(values, 1e-12))
+        values = np.maximum(values, 1e-12)  # a limit of 0 would have no multiples
+        logarithms = np.log(values)
         usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
         return float(min(usual, self.reach * np.max(values)))
 
