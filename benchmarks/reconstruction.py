@@ -131,7 +131,7 @@ def right_verdicts(found: list[Found], limits: Limits | None, wanted: str) -> st
 
 
 def render_of(mesh: Mesh) -> np.ndarray:
-    return render(*mesh, size=192) if len(mesh[1]) else None
+    return render(*mesh, size=192) if len(mesh[1]) else "no surface"
 
 
 def view_line(shapes: list[StoredShape], kind: Alike, meshes: list[Mesh]) -> str:

@@ -45,6 +45,7 @@ def write_cell(
     seconds: float = 100.0,
     parameters: int = 1000,
     ids: str = "chairs/{:04d}",
+    made_with: dict[str, str] | None = None,
 ) -> Path:
     """Enters a cell into the plan and writes what a finished training of it leaves behind."""
     enter_cells(sweep, [cell])
@@ -55,7 +56,8 @@ def write_cell(
         role: [score(ids.format(k + 100 * (role == "held_out")), cd) for k, cd in enumerate(values)]
         for role, values in roles.items()
     }
-    metrics = {"training": {"seconds": seconds, "steps": 50, "parameters": parameters}}
+    training = {"seconds": seconds, "steps": 50, "parameters": parameters}
+    metrics = {"training": training | ({"made_with": made_with} if made_with else {})}
     metrics |= {role: {"summary": {}, "shapes": rows} for role, rows in shapes.items() if rows}
     (folder / "metrics.json").write_text(json.dumps(metrics))
     config = {

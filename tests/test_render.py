@@ -84,7 +84,10 @@ def test_a_slice_with_holes_in_it_still_draws():
 def test_a_contact_sheet_shows_every_cell_and_says_where_a_surface_is_missing(tmp_path):
     red = np.zeros((40, 40, 3), np.uint8) + np.uint8([200, 30, 30])
     path = contact_sheet(
-        [[red, None], [None, red]], ["truth", "ours"], ["a", "b" * 90], tmp_path / "x" / "s.png"
+        [[red, "no surface"], ["no surface", red]],
+        ["truth", "ours"],
+        ["a", "b" * 90],
+        tmp_path / "x" / "s.png",
     )
     page = np.asarray(Image.open(path)).astype(int)
     assert (page == [200, 30, 30]).all(axis=-1).sum() == 2 * 40 * 40
@@ -98,7 +101,7 @@ def test_a_contact_sheet_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", full_disc)
     with pytest.raises(OSError, match="no space"):
-        contact_sheet([[None]], [], [], tmp_path / "s.png")
+        contact_sheet([["no surface"]], [], [], tmp_path / "s.png")
     assert os.listdir(tmp_path) == []
 
 

@@ -15,9 +15,10 @@ from sdfhub.errors import SdfhubError
 from sdfhub.report.claims import verdicts
 from sdfhub.report.formats import csv_text, latex, markdown
 from sdfhub.report.meshes import Mesh, reconstruction
+from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
 from sdfhub.report.paper import CLAIMS, COSTS, PRINTED
-from sdfhub.report.pictures import packed
+from sdfhub.report.pictures import Gallery, packed
 from sdfhub.report.plan import PLAN, enter_cells, locked, read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
@@ -32,8 +33,11 @@ def only_group(sweep):
     return group
 
 
-def no_truth(id):
-    return None
+def page_of(sweep, name="sweep"):
+    """The page of a sweep whose true shapes are not on this machine."""
+    cells = read_sweep(sweep)
+    origin = origin_table(read_plan(sweep).commands, cells)
+    return page(name, cells, group_cells(cells), origin, Gallery(lambda id: None), 2)
 
 
 @pytest.fixture
@@ -115,7 +119,7 @@ def test_failed_missing_and_broken_cells_are_told_in_a_line_each(small):
     ]
     states = {row[0]: row[7] for row in tables(group)[0].rows}
     assert (states["SIREN + normals"], states["FFT/HOSC + normals"]) == ("failed", "missing")
-    html = page("sweep", read_sweep(small), [group], no_truth, 2)
+    html = page_of(small)
     assert "loss is not finite at step 7" in html and "has not been run" in html
 
 
@@ -173,7 +177,7 @@ def test_names_and_reasons_are_text_in_every_format(tmp_path):
     (sweep / failed.folder).mkdir()
     (sweep / failed.folder / "failed.json").write_text(json.dumps({"reason": evil}))
     group = only_group(sweep)
-    html = page(evil, read_sweep(sweep), [group], no_truth, 2)
+    html = page_of(sweep, evil)
     assert "<img src=x" not in html and "onerror=&#34;" in html
     assert html.count("</script>") == 2, "the page's own two"
     assert "49" not in re.sub(r"[\d:-]+ UTC", "", html.split("<main>")[0]), "no template in a name is run"
@@ -184,7 +188,7 @@ def test_names_and_reasons_are_text_in_every_format(tmp_path):
 
 
 def test_the_page_fetches_nothing_and_says_so_to_the_browser(small):
-    html = page("sweep", read_sweep(small), [only_group(small)], no_truth, 2)
+    html = page_of(small)
     assert "default-src 'none'" in html and "'sha256-" in html
     assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", html)
     assert "http:" not in html and "https:" not in html
@@ -259,7 +263,27 @@ def test_a_cell_under_new_defaults_replaces_its_old_one_in_the_plan(tmp_path):
     old = planned("SIREN")
     enter_cells(tmp_path, [old, planned("FFT/SIREN")])
     enter_cells(tmp_path, [old.model_copy(update={"folder": "new"})])
-    assert [cell.folder for cell in read_plan(tmp_path)] == ["new", planned("FFT/SIREN").folder]
+    assert [cell.folder for cell in read_plan(tmp_path).cells] == ["new", planned("FFT/SIREN").folder]
+
+
+def test_a_report_says_how_its_sweep_was_made(tmp_path):
+    first = "python train.py -m sweeps=table_small"
+    second = f"{first} 'data.x=[1, 2]'"
+    with_ = {"torch": "2.13.0", "device": "Some CPU | 3"}
+    write_cell(tmp_path, planned("SIREN", seed=0), [0.1e-3], seconds=200, made_with=with_)
+    write_cell(tmp_path, planned("SIREN", seed=1), [0.1e-3], seconds=100, made_with=with_)
+    write_cell(tmp_path, planned("DeepSDF", "off"), [0.1e-3], seconds=3300)
+    for command in (first, second, first):
+        enter_cells(tmp_path, [planned("FFT/HOSC")], command)
+    assert origin_table(read_plan(tmp_path).commands, read_sweep(tmp_path)).rows == [
+        ["command", first],
+        ["command", second],
+        ["trainings", "3 of 4 done, 60.0 min in all"],
+        ["2 of them with", "torch 2.13.0, device Some CPU | 3"],
+        ["1 of them with", "not written down"],
+    ]
+    html = page_of(tmp_path)
+    assert "data.x=[1, 2]" in html and "Some CPU | 3" in html
 
 
 def test_a_lock_is_held_once_and_freed(tmp_path):
@@ -287,13 +311,14 @@ def test_packed_meshes_unpack_to_the_same_places_within_a_step():
     assert packed(mesh, triangles=100)["faces"] <= 110
 
 
-def test_the_command_takes_a_folder_of_any_name_and_writes_four_files(small, monkeypatch, tmp_path, capsys):
+def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monkeypatch, tmp_path, capsys):
     strange = small.rename(tmp_path / "it's, a=[sweep] $x")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["sdfhub report", str(strange), "shapes=2"])
     report_task.main()
     written = {path.name for path in (strange / "report").iterdir()}
-    assert written == {"table.md", "table.tex", "table.csv", "report.html"}
+    sheet = "sheet_table_small_procedural_chairs_cpu.png"
+    assert written == {"table.md", "table.tex", "table.csv", "report.html", sheet}
     assert "DeepSDF" in capsys.readouterr().out
 
 

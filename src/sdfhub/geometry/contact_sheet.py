@@ -11,7 +11,7 @@ _INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
 
 
 def contact_sheet(
-    rows: Sequence[Sequence[np.ndarray | None]],
+    rows: Sequence[Sequence[np.ndarray | str]],
     row_labels: Sequence[str],
     column_captions: Sequence[str],
     path: str | os.PathLike,
@@ -19,7 +19,7 @@ def contact_sheet(
     """Lays pictures out as a grid and writes it as one PNG, whole or not at all.
 
     Args:
-        rows: pictures [S, S, 3] uint8 of one size; None (no surface) gets a tile that says so.
+        rows: pictures [S, S, 3] uint8 of one size; a text, such as "no surface", gets a tile that says it.
         row_labels: one text per row; [] for none.
         column_captions: one text per column, of one or two lines; [] for none.
         path: where the PNG goes; its folder is made.
@@ -27,7 +27,7 @@ def contact_sheet(
     Returns:
         The path written.
     """
-    size = next((len(image) for row in rows for image in row if image is not None), 256)
+    size = next((len(image) for row in rows for image in row if not isinstance(image, str)), 256)
     columns = max((len(row) for row in rows), default=0)
     font = ImageFont.load_default(max(11, size // 14))
     left = int(max((font.getlength(label) for label in row_labels), default=0)) + 20 if row_labels else 6
@@ -40,8 +40,8 @@ def contact_sheet(
     for i, row in enumerate(rows):
         for j, image in enumerate(row):
             x, y = left + j * size, top + i * size
-            if image is None:
-                _no_surface(draw, x, y, size)
+            if isinstance(image, str):
+                _told(draw, image, x, y, size)
             else:
                 page.paste(Image.fromarray(image), (x, y))
     for i, label in enumerate(row_labels):
@@ -53,10 +53,10 @@ def contact_sheet(
     return write_picture(page, Path(path))
 
 
-def _no_surface(draw: ImageDraw.ImageDraw, x: int, y: int, size: int) -> None:
+def _told(draw: ImageDraw.ImageDraw, text: str, x: int, y: int, size: int) -> None:
     pad, font = size // 16, ImageFont.load_default(max(6, size // 9))
     draw.rectangle((x + pad, y + pad, x + size - pad, y + size - pad), fill=_TILE, outline=_FAINT)
-    draw.text((x + size / 2, y + size / 2), "no surface", fill=_FAINT, font=font, anchor="mm")
+    draw.text((x + size / 2, y + size / 2), text, fill=_FAINT, font=font, anchor="mm")
 
 
 def _shortened(text: str, font, width: float) -> str:

@@ -13,8 +13,7 @@ from markupsafe import Markup
 from sdfhub.report.charts import Series, line_chart, strip_chart
 from sdfhub.report.claims import Verdict, verdicts
 from sdfhub.report.curves import curve
-from sdfhub.report.meshes import FindTruth
-from sdfhub.report.pictures import Gallery, Sheet
+from sdfhub.report.pictures import Gallery, Sheet, data_uri
 from sdfhub.report.results import Cell
 from sdfhub.report.rows import Group, Row
 from sdfhub.report.tables import Table, tables
@@ -40,17 +39,20 @@ class Part:
     meshes: int | None
 
 
-def page(name: str, cells: list[Cell], groups: list[Group], find_truth: FindTruth, shapes: int) -> str:
+def page(
+    name: str, cells: list[Cell], groups: list[Group], origin: Table, gallery: Gallery, shapes: int
+) -> str:
     """The whole page as text.
 
     Args:
         name: of the sweep.
         cells: all of them.
         groups: their rows.
-        find_truth: prepared shapes by id.
+        origin: how it was made.
+        gallery: draws shapes.
         shapes: on a contact sheet.
     """
-    gallery, meshes, parts = Gallery(find_truth), [], []
+    meshes, parts = [], []
     for group in groups:
         turning = gallery.turning(group, min(shapes, TO_TURN), MESH_BYTES // len(groups))
         parts.append(_part(group, gallery, shapes, len(meshes) if turning else None))
@@ -64,6 +66,7 @@ def page(name: str, cells: list[Cell], groups: list[Group], find_truth: FindTrut
         version=_version(),
         parts=parts,
         meshes=meshes,
+        origin=origin,
         style=Markup(_text("page.css")),
         script=Markup(script),
         script_hash=Markup(f"sha256-{digest}"),
@@ -121,6 +124,7 @@ def _template():
     environment = Environment(
         loader=PackageLoader("sdfhub.report", "."), autoescape=True, undefined=StrictUndefined
     )
+    environment.filters["data_uri"] = data_uri
     return environment.get_template("page.html.j2")
 
 

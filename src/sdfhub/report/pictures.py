@@ -25,12 +25,12 @@ class Tile:
     """One picture.
 
     Args:
-        image: a data URI; "" where there is no surface or no file.
+        image: [S, S, 3] uint8; None where there is no surface or no file.
         caption: below it.
-        alt: what a picture that is not there would have shown.
+        alt: what stands in the place of a picture that is not there.
     """
 
-    image: str
+    image: np.ndarray | None
     caption: str
     alt: str
 
@@ -52,14 +52,14 @@ class Gallery:
     """
 
     find_truth: FindTruth
-    _images: dict[tuple, str] = field(default_factory=dict)
+    _images: dict[tuple, np.ndarray | None] = field(default_factory=dict)
 
     def sheet(self, group: Group, count: int) -> Sheet:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
         columns = [f"{id} ({'known' if role == 'known' else 'held out'})" for role, id in shown]
         truth = [Tile(self._truth_image(id), "", "no truth") for _, id in shown]
-        rows = [("Ground truth", truth)] if any(tile.image for tile in truth) else []
+        rows = [("Ground truth", truth)] if any(tile.image is not None for tile in truth) else []
         for row in group.rows:
             if row.done:
                 rows.append((row.label, [self._tile(row, role, id) for role, id in shown]))
@@ -107,16 +107,16 @@ class Gallery:
     def _tile(self, row: Row, role: str, id: str) -> Tile:
         score = _score(row, role, id)
         if score is None:
-            return Tile("", "", "not judged")
+            return Tile(None, "", "not judged")
         key = (row.done[0].folder, role, id)
         if key not in self._images:
-            self._images[key] = data_uri(self._mesh(row, role, id))
+            self._images[key] = picture(self._mesh(row, role, id))
         caption = "no surface" if score.failed else f"CD {score.counted_cd * 1e3:.3f}"
         return Tile(self._images[key], caption, "no surface" if score.failed else "no mesh")
 
-    def _truth_image(self, id: str) -> str:
+    def _truth_image(self, id: str) -> np.ndarray | None:
         if ("truth", id) not in self._images:
-            self._images["truth", id] = data_uri(true_mesh(self.find_truth(id)))
+            self._images["truth", id] = picture(true_mesh(self.find_truth(id)))
         return self._images["truth", id]
 
     def _mesh(self, row: Row, role: str, id: str) -> Mesh | None:
@@ -140,11 +140,13 @@ def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     return [("known", id) for id in known] + [("held_out", id) for id in unseen]
 
 
-def data_uri(mesh: Mesh | None) -> str:
-    """A picture of a mesh as a WebP data URI; "" without a mesh."""
-    if mesh is None:
-        return ""
-    image = render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
+def picture(mesh: Mesh | None) -> np.ndarray | None:
+    """A mesh from the usual side, [S, S, 3] uint8; None without a mesh."""
+    return mesh and render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
+
+
+def data_uri(image: np.ndarray) -> str:
+    """A picture as a WebP data URI."""
     content = io.BytesIO()
     Image.fromarray(image).save(content, "WEBP", quality=82)
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()

@@ -52,16 +52,17 @@ class Plan(BaseModel):
 
     version: Literal[1] = 1
     cells: list[PlannedCell] = []
+    commands: list[Text] = []
 
 
-def read_plan(sweep: Path) -> list[PlannedCell]:
-    """The cells of a sweep's folder, in the order of their commands.
+def read_plan(sweep: Path) -> Plan:
+    """What a sweep's folder consists of: its cells in the order of their commands, and these.
 
     Raises:
         SdfhubError: it is not a sweep's folder, or `sweep.json` is broken.
     """
     try:
-        return Plan.model_validate_json((sweep / PLAN).read_bytes()).cells
+        return Plan.model_validate_json((sweep / PLAN).read_bytes())
     except OSError as error:
         raise SdfhubError(
             f"{sweep}: not a sweep's folder ({PLAN}: {(error.strerror or 'unreadable').lower()})"
@@ -72,14 +73,18 @@ def read_plan(sweep: Path) -> list[PlannedCell]:
         raise SdfhubError(f"{sweep / PLAN}: {place}: {first['msg'].lower()}") from error
 
 
-def enter_cells(sweep: Path, cells: Iterable[PlannedCell]) -> None:
-    """Adds cells to `sweep.json`; replaces those whose settings have changed. Safe side by side."""
+def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
+    """Adds cells to `sweep.json`, and the command that asked for them. Safe side by side.
+
+    A cell whose settings have changed is replaced.
+    """
     sweep.mkdir(parents=True, exist_ok=True)
     with locked(sweep / ".lock"):
-        known = {cell.identity: cell for cell in (read_plan(sweep) if (sweep / PLAN).exists() else ())}
-        known |= {cell.identity: cell for cell in cells}
+        old = read_plan(sweep) if (sweep / PLAN).exists() else Plan()
+        known = {cell.identity: cell for cell in (*old.cells, *cells)}
         by_folder = {cell.folder: cell for cell in known.values()}  # seed=0 said or left out is one cell
-        plan = Plan(cells=list(by_folder.values()))
+        commands = dict.fromkeys([*old.commands, *([command[:2000]] if command else [])])
+        plan = Plan(cells=list(by_folder.values()), commands=list(commands))
         write_whole(sweep / PLAN, json.dumps(plan.model_dump(), indent=1).encode())
 
 

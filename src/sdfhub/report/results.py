@@ -3,10 +3,10 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import FAILURE, PlannedCell, is_locked, read_plan
@@ -18,6 +18,9 @@ class _Read(BaseModel):
     """Numbers must be finite; what a file says beside the fields is not looked at."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+
+Name = Annotated[str, StringConstraints(max_length=200)]
 
 
 class ShapeScore(_Read):
@@ -41,11 +44,12 @@ class ShapeScore(_Read):
 
 
 class Training(_Read):
-    """The cost of a training."""
+    """The cost of a training, and versions and hardware by name, which old runs do not tell."""
 
     seconds: float
     steps: int
     parameters: int
+    made_with: dict[Name, Name] = {}
 
 
 class _Role(_Read):
@@ -126,7 +130,7 @@ def read_sweep(sweep: Path) -> list[Cell]:
     Raises:
         SdfhubError: not a sweep's folder.
     """
-    return [_read_cell(plan, sweep / plan.folder) for plan in read_plan(sweep)]
+    return [_read_cell(plan, sweep / plan.folder) for plan in read_plan(sweep).cells]
 
 
 def _read_cell(plan: PlannedCell, folder: Path) -> Cell:

@@ -35,7 +35,9 @@ def write_gallery(
     bar = tqdm(found, total=len(codes), desc="meshing", unit="shape", leave=False, disable=None)
     meshes = list(bar)
     pictures = [render(*mesh, up=space.up) for mesh in meshes]
-    shown = [picture if len(mesh[1]) else None for picture, mesh in zip(pictures, meshes, strict=True)]
+    shown = [
+        picture if len(mesh[1]) else "no surface" for picture, mesh in zip(pictures, meshes, strict=True)
+    ]
     columns = len(shown) if animated else COLUMNS
     rows = [shown[start : start + columns] for start in range(0, len(shown), columns)]
     contact_sheet(rows, [], captions if len(rows) == 1 else [], out / "strip.png")

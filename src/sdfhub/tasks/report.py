@@ -9,9 +9,13 @@ from omegaconf import DictConfig
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.store import Store, preparation_hash
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.report.formats import csv_text, latex, markdown
 from sdfhub.report.meshes import FindTruth
+from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
+from sdfhub.report.pictures import Gallery, Sheet
+from sdfhub.report.plan import read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import Group, group_cells
 from sdfhub.report.tables import claims_table, tables
@@ -22,7 +26,7 @@ from sdfhub.whole_file import write_whole
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
-    """Writes `table.md`, `table.tex`, `table.csv` and `report.html`, and prints the tables.
+    """Writes `table.md`, `.tex` and `.csv`, a contact sheet a group and `report.html`; prints the tables.
 
     Args:
         sweep: folder of a multirun, finished or not.
@@ -37,11 +41,23 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     all_tables = [table for group in groups for table in tables(group)]
     print("\n" + markdown(all_tables))
     claims = [claims_table(group) for group in groups]
-    write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims])}")
+    origin = origin_table(read_plan(sweep).commands, cells)
+    write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims, origin])}")
     write_whole(out / "table.tex", latex(all_tables))
     write_whole(out / "table.csv", csv_text(groups))
-    write_whole(out / "report.html", page(sweep.name, cells, groups, truth_finder(groups), shapes))
+    gallery = Gallery(truth_finder(groups))
+    for group in groups:
+        write_sheet(gallery.sheet(group, shapes), out / f"{'_'.join(['sheet', *group.choices.values()])}.png")
+    write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
     print(f"report: {out / 'report.html'}", flush=True)
+
+
+def write_sheet(sheet: Sheet, path: Path) -> None:
+    """A contact sheet as a picture of its own; none where nothing was judged."""
+    rows = [[tile.alt if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
+    if rows:
+        captions = [column.replace(" (", "\n(") for column in sheet.columns]
+        contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
 
 
 def truth_finder(groups: list[Group]) -> FindTruth:

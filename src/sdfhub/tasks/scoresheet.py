@@ -122,7 +122,9 @@ def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
         row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]
     ]
     truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces, up=row.shape.up) for row in shown]
-    ours = [render(row.vertices, row.faces, up=row.shape.up) if len(row.faces) else None for row in shown]
+    ours = [
+        render(row.vertices, row.faces, up=row.shape.up) if len(row.faces) else "no surface" for row in shown
+    ]
     captions = [f"{row.shape.id}\n{_title(row)}" for row in shown]
     contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
 

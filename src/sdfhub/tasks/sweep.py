@@ -1,5 +1,6 @@
 """A multirun from its first cell to its report: what is planned, what came of it, the exit status."""
 
+import shlex
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -46,7 +47,7 @@ class SweepRecord(Callback):
         except Exception as error:  # the sweeper composes the same, and tells it better
             print(f"sdfhub: the sweep cannot be planned: {error}", file=sys.stderr)
             return
-        enter_cells(Path(config.hydra.sweep.dir), self._planned)
+        enter_cells(Path(config.hydra.sweep.dir), self._planned, command_line(config))
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         if not _is_training(config):
@@ -58,7 +59,7 @@ class SweepRecord(Callback):
             write_report(sweep, sweep / "report")
         except SdfhubError as error:
             print(f"sdfhub: error: {error}", file=sys.stderr)
-        cells = self._planned or read_plan(sweep)
+        cells = self._planned or read_plan(sweep).cells
         failed = [cell for cell in cells if (sweep / cell.folder / FAILURE).exists()]
         if failed:
             print(f"sdfhub: error: {len(failed)} of {len(cells)} cells failed", file=sys.stderr)
@@ -79,6 +80,13 @@ def refuse_missing_plugins(config: DictConfig) -> None:
                 f"hydra/{role}={config.hydra.runtime.choices[f'hydra/{role}']}: is not installed here; "
                 f"pip install 'sdfhub[{EXTRAS[name]}]'"
             )
+
+
+def command_line(config: DictConfig) -> str:
+    """The command of a multirun as one would type it again, wherever `train.py` lies."""
+    said = [*config.hydra.overrides.task, *config.hydra.overrides.hydra]
+    words = [word for word in said if not word.startswith("hydra.mode=")]
+    return shlex.join(["python", "train.py", "-m", *words])
 
 
 def planned_cells(config: DictConfig) -> list[PlannedCell]:

@@ -25,6 +25,7 @@ from sdfhub.tasks.callbacks import LossBar, LossLines, TrainingRecord
 from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, evaluate_model
+from sdfhub.tasks.made_with import made_with
 from sdfhub.tasks.names import flat
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.processes import ending_together
@@ -88,7 +89,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
     if not trainer.is_global_zero:
         return {}
-    training = parts.record.summary(model)
+    training = parts.record.summary(model) | {"made_with": made_with(trainer)}
     if not parts.record.stepped:
         print(f"nothing was left to train in {parts.resume_from}: raise trainer.max_epochs to go on")
     known = dict(enumerate(prepared.train))
