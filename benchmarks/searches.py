@@ -5,8 +5,8 @@
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
 
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. The
-objective is what the search lowered: the geometric mean of known and held-out shapes' median excess CD, times
-10^3. Settings are those in which its trainings differ. Trials that failed are counted and have no objective.
+objective is what the search lowered: the geometric mean of known and held-out shapes' median excess CD; all
+three times 10^3. Settings are those in which the trainings of a search differ.
 """
 
 import argparse
@@ -14,67 +14,87 @@ import csv
 import io
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from statistics import median
+from typing import NamedTuple
 
-import yaml
-
+from sdfhub.errors import SdfhubError
+from sdfhub.report.results import Scores, read_scores, read_sweep
 from sdfhub.tasks.names import flat
 from sdfhub.tasks.search import objective
 from sdfhub.whole_file import write_whole
 
-DEFAULTS = "defaults"
+SCORES = ("objective", "known", "held_out", "seconds")
 
 
 class Trial(NamedTuple):
-    """One training: its folder, flat settings, objective times 10^3 (None: failed), training seconds."""
+    """A training: rank or name, SCORES times 10^3 (seconds as they are; None: failed), settings by key."""
 
     name: str
-    settings: dict[str, Any]
-    objective: float | None
-    seconds: float | None
+    scores: dict[str, float | None]
+    settings: dict[str, str]
 
 
-def read_trial(folder: Path) -> Trial:
-    settings = flat(yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8")))
-    try:
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return Trial(folder.name, settings, None, None)
-    value = objective(metrics)
-    return Trial(
-        folder.name, settings, None if value is None else value * 1e3, metrics["training"]["seconds"]
+def judged(folder: Path, scores: Scores | None) -> dict[str, float | None]:
+    """SCORES of a training's folder."""
+    if scores is None:
+        return dict.fromkeys(SCORES)
+    excess = {role: median(shape.excess for shape in shapes) * 1e3 for role, shapes in scores.shapes.items()}
+    value = objective(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
+    return {"objective": value * 1e3, **excess, "seconds": scores.training.seconds}
+
+
+def read_search(folder: Path) -> list[Trial]:
+    """A search's finished and failed trials, the best first, then the defaults where they are there."""
+    cells = [cell for cell in read_sweep(folder) if cell.state != "missing"]
+    said = [cell.plan.settings for cell in cells]
+    searched = [key for key in said[0] if len({settings.get(key) for settings in said}) > 1] if said else []
+    found = [
+        Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})
+        for cell in cells
+    ]
+    found.sort(
+        key=lambda trial: float("inf") if trial.scores["objective"] is None else trial.scores["objective"]
     )
+    ranked = [trial._replace(name=str(rank)) for rank, trial in enumerate(found, 1)]
+    defaults = folder / "defaults"
+    if (defaults / "metrics.json").exists():
+        scores = read_scores(defaults)
+        settings = flat(scores.config)
+        ranked.append(
+            Trial("defaults", judged(defaults, scores), {key: shown(settings[key]) for key in searched})
+        )
+    return ranked
 
 
-def read_search(folder: Path) -> tuple[list[Trial], Trial | None, list[str]]:
-    """A search's trials, the best first, the defaults, and the names of the settings that were searched."""
-    found = [read_trial(path.parent) for path in sorted(folder.glob("*/config.yaml"))]
-    trials = [trial for trial in found if trial.name != DEFAULTS]
-    trials.sort(key=lambda trial: float("inf") if trial.objective is None else trial.objective)
-    keys = trials[0].settings if trials else {}
-    own = [key for key in keys if not key.startswith(("decoder.", "scale."))]  # these repeat others
-    searched = [key for key in own if len({str(trial.settings.get(key)) for trial in trials}) > 1]
-    return trials, next((trial for trial in found if trial.name == DEFAULTS), None), searched
+def shown(value: float | int | str) -> str:
+    """Three digits are all that a search can tell."""
+    return f"{float(value):.3g}"
 
 
-def line(rank: str, trial: Trial, searched: list[str]) -> str:
-    settings = ", ".join(f"{key}={shown(trial.settings.get(key))}" for key in searched)
-    value = "failed" if trial.objective is None else f"{trial.objective:.4f}"
-    return f"| {rank} | {value} | {shown(trial.seconds)} | {settings} |"
+def markdown(trials: list[Trial], best: int) -> str:
+    """A table of the best trials, and of the defaults."""
+    heads = ["", *SCORES, *(trials[0].settings if trials else ())]
+    lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
+    for trial in trials:
+        if trial.name == "defaults" or int(trial.name) <= best:
+            numbers = ["failed" if v is None else f"{v:.4g}" for v in trial.scores.values()]
+            lines.append("| " + " | ".join([trial.name, *numbers, *trial.settings.values()]) + " |")
+    return "\n".join(lines)
 
 
-def shown(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def write_csv(path: Path, searches: dict[str, list[Trial]], keys: list[str]) -> None:
+def csv_text(searches: dict[str, list[Trial]]) -> str:
+    """Every trial of every search, a line each."""
+    keys = list(
+        dict.fromkeys(key for trials in searches.values() for trial in trials for key in trial.settings)
+    )
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["search", "objective", "seconds", *keys])
+    rows.writerow(["search", "trial", *SCORES, *keys])
     for name, trials in searches.items():
         for trial in trials:
-            rows.writerow([name, trial.objective, trial.seconds, *map(trial.settings.get, keys)])
-    write_whole(path, text.getvalue())
+            scores = ["" if value is None else f"{value:.6g}" for value in trial.scores.values()]
+            rows.writerow([name, trial.name, *scores, *(trial.settings.get(key, "") for key in keys)])
+    return text.getvalue()
 
 
 def main() -> None:
@@ -83,20 +103,16 @@ def main() -> None:
     parser.add_argument("--best", type=int, default=3)
     parser.add_argument("--csv", type=Path, help="all trials")
     arguments = parser.parse_args()
-    all_trials, all_keys = {}, []
-    for folder in arguments.searches:
-        trials, defaults, searched = read_search(folder)
-        failed = sum(trial.objective is None for trial in trials)
-        print(f"\n{folder.name}: {len(trials)} trials, {failed} failed\n")
-        print("| rank | excess | training s | settings |\n| --- | --- | --- | --- |")
-        for rank, trial in enumerate(trials[: arguments.best], 1):
-            print(line(str(rank), trial, searched))
-        if defaults:
-            print(line("defaults", defaults, searched))
-        all_trials[folder.name] = trials + ([defaults] if defaults else [])
-        all_keys += [key for key in searched if key not in all_keys]
+    try:
+        searches = {folder.name: read_search(folder) for folder in arguments.searches}
+    except SdfhubError as error:
+        parser.error(str(error))
+    for name, trials in searches.items():
+        failed = sum(trial.scores["objective"] is None for trial in trials)
+        print(f"\n### {name}: {sum(trial.name != 'defaults' for trial in trials)} trials, {failed} failed\n")
+        print(markdown(trials, arguments.best))
     if arguments.csv:
-        write_csv(arguments.csv, all_trials, all_keys)
+        write_whole(arguments.csv, csv_text(searches))
 
 
 if __name__ == "__main__":

@@ -142,7 +142,7 @@ class OurStep:
         batch = self.batches[self.step]
         self.optimizer.zero_grad()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
-            loss, _ = self.model.objective(batch, progress=0.5, epoch=10)
+            loss, _ = self.model.objective(batch, progress=0.5)
         loss.backward()
         self.optimizer.step()
         self.step += 1

@@ -98,6 +98,8 @@ def test_numbers_that_are_not_finite_stay_so():
     product = torch.tensor([[[float("nan"), float("inf"), 1.0]]])
     value = Hosc(5.0, 3.0, 2.0).shifted(product, torch.zeros(3))
     assert value[0, 0, :2].isnan().all() and value[0, 0, 2].isfinite()
+    value = Relu().shifted(product, torch.zeros(3))
+    assert value[0, 0, 0].isnan() and value[0, 0, 1] == float("inf") and value[0, 0, 2] == 1
 
 
 def test_the_loops_leave_pytorchs_threads_alone_and_take_callers_from_several_threads():
@@ -181,6 +183,59 @@ def test_dropout_keeps_the_right_share_unbiased_and_seeded(dropout):
     assert float(neighbours) == pytest.approx(1, abs=1e-2), "neighbours are dropped independently"
     plain = F.dropout(torch.ones(400, 500), dropout)
     assert float(factors.mean(dim=1).std()) == pytest.approx(float(plain.mean(dim=1).std()), rel=0.2)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["fp32", "bf16"])
+def test_dropout_in_the_loop_of_a_rectifier_is_dropout_after_it(dtype):
+    """Factors are read off the output: they must be dropout's, and gradients must meet the same ones."""
+    product, shift = products(width=64)
+    product = product.detach().to(dtype).requires_grad_()
+    beside = torch.randn(3, 300, 5)
+    torch.manual_seed(4)
+    together, slope = Relu().shifted_with_slope(product, shift, beside, 0.2)
+    torch.manual_seed(4)
+    assert torch.equal(together, Relu().shifted(product, shift, beside, 0.2)), "seeded"
+    assert not torch.equal(together, Relu().shifted(product, shift, beside, 0.2)), "and drawn anew"
+    value = together[..., :64]
+    assert torch.equal(together[..., 64:], beside.to(dtype))
+    on = torch.relu(product.float() + shift) > 0
+    factors = slope.float()[on]
+    assert set(factors.unique().tolist()) == {0.0, torch.tensor(1.25, dtype=dtype).item()}
+    assert float((factors == 0).float().mean()) == pytest.approx(0.2, abs=0.01)
+    assert (slope[~on] == 0).all() and not slope.requires_grad
+    torch.testing.assert_close(value, (torch.relu(product.float() + shift) * slope.float()).to(dtype))
+    by = torch.randn_like(value)
+    have = torch.autograd.grad(value, [product, shift], by)
+    want = by.float() * slope.float()
+    torch.testing.assert_close(have[0], want.to(dtype))
+    torch.testing.assert_close(have[1], want.sum(1, keepdim=True), rtol=1e-4, atol=1e-4)
+
+
+def test_a_rectifiers_dropped_units_are_independent_of_each_other():
+    torch.manual_seed(5)
+    on = torch.ones(1, 4000, 64)
+    first, second = (Relu().shifted(on, torch.zeros(64), dropout=0.5)[0] - 1 for _ in range(2))
+    for other in (second, first.roll(1, 0), first.roll(1, 1), first.roll((1, 1), (0, 1)), first.roll(7, 1)):
+        assert abs(float((first * other).mean())) < 0.01, "some 5 standard deviations"
+    plain = F.dropout(on, 0.5)[0]
+    for axis in (0, 1):
+        spread = first.mean(axis).std() / plain.mean(axis).std()
+        assert 0.6 < float(spread) < 1.5
+
+
+def test_a_rectifiers_gradient_can_be_differentiated_again():
+    product, shift = products()
+    value = Relu().shifted(product, shift)
+    (slope,) = torch.autograd.grad(value.square().sum(), product, create_graph=True)
+    plain = torch.relu(product + shift)
+    (want,) = torch.autograd.grad(plain.square().sum(), product, create_graph=True)
+    torch.testing.assert_close(slope, want)
+    for have, exact in zip(
+        torch.autograd.grad(slope.square().sum(), [product, shift]),
+        torch.autograd.grad(want.square().sum(), [product, shift]),
+        strict=True,
+    ):
+        torch.testing.assert_close(have, exact)
 
 
 def random_batch(shapes=5, samples=33, surface=9) -> Batch:

@@ -13,7 +13,7 @@ from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
 from sdfhub.model.optim import Adam, Cosine, StepDecay
 from sdfhub.shapes import Batch
 
-LOSS = SdfLoss(delta=0.1, lambda_code=1e-4, code_norm="squared", warmup_epochs=100, tau=0.01)
+LOSS = SdfLoss(delta=0.1, lambda_code=1e-4, code_norm="squared", warmup=0.2, tau=0.01)
 
 
 @dataclasses.dataclass
@@ -63,10 +63,10 @@ def test_normal_term_is_the_mean_squared_difference():
 
 def test_prior_warms_up_and_parts_add_their_weights():
     args = torch.zeros(1, 4), torch.zeros(1, 4), torch.ones(1, 4)
-    half = LOSS.parts(*args, None, None, epoch=50)
+    half = LOSS.parts(*args, None, None, progress=0.1)
     assert torch.isclose(half["code"], torch.tensor(1e-4 * 0.5 * 4))
-    assert torch.isclose(LOSS.parts(*args, None, None, epoch=500)["code"], torch.tensor(1e-4 * 4))
-    with_normals = LOSS.parts(*args, torch.zeros(1, 2, 3), torch.ones(1, 2, 3), epoch=0)
+    assert torch.isclose(LOSS.parts(*args, None, None, progress=0.9)["code"], torch.tensor(1e-4 * 4))
+    with_normals = LOSS.parts(*args, torch.zeros(1, 2, 3), torch.ones(1, 2, 3), progress=0)
     assert torch.isclose(with_normals["normal"], torch.tensor(0.01 * 3))
     assert set(half) == {"sdf", "code"}
 

@@ -12,7 +12,10 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from sdfhub.model.waves import Wave, fits
+from sdfhub.model.dropout import kept
+from sdfhub.model.loops import fits
+from sdfhub.model.rectifier import Rectifier
+from sdfhub.model.waves import Wave
 
 
 def joined(hidden: Tensor, beside: Tensor | None) -> Tensor:
@@ -35,22 +38,29 @@ class Activation(nn.Module, ABC):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """a(x) and a'(x), both shaped like x and both differentiable."""
 
-    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
+    def shifted(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
+    ) -> Tensor:
         """[a(product + shift) | beside], [B, N, W + F] with the dtype of `product`.
 
         Args:
             product: [B, N, W].
             shift: [W] or [B, 1, W] float32.
             beside: [B, N, F], what the next layer reads beside this one; None for nothing, F = 0.
+            dropout: probability in [0, 1) that a hidden unit is 0; the others are divided by 1 - dropout.
         """
-        return joined(self(product + shift).to(product.dtype), beside)
+        value = self(product + shift).to(product.dtype)
+        return joined(value * kept(value, dropout) if dropout else value, beside)
 
     def shifted_with_slope(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
     ) -> tuple[Tensor, Tensor]:
-        """As `shifted`, and a'(product + shift) [B, N, W]."""
-        value, slope = self.with_slope(product + shift)
-        return joined(value.to(product.dtype), beside), slope.to(product.dtype)
+        """As `shifted`, and a'(product + shift) [B, N, W], dropped alike."""
+        value, slope = (each.to(product.dtype) for each in self.with_slope(product + shift))
+        if dropout:
+            factors = kept(value, dropout)
+            value, slope = value * factors, slope * factors
+        return joined(value, beside), slope
 
     @abstractmethod
     def weight_bound(self, fan_in: int) -> float:
@@ -77,9 +87,19 @@ class Relu(Activation):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return torch.relu(x), (x > 0).to(x.dtype)
 
-    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
-        # rounds as often as a cast of the result would
-        return joined(torch.relu_(product + shift.to(product.dtype)), beside)
+    def shifted(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
+    ) -> Tensor:
+        if not fits(product):
+            return super().shifted(product, shift, beside, dropout)
+        return Rectifier.apply(product, shift, beside, dropout, False)
+
+    def shifted_with_slope(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
+    ) -> tuple[Tensor, Tensor]:
+        if not fits(product):
+            return super().shifted_with_slope(product, shift, beside, dropout)
+        return Rectifier.apply(product, shift, beside, dropout, True)
 
 
 class Siren(Activation):
@@ -110,16 +130,18 @@ class Siren(Activation):
         angle = self.omega * x
         return torch.sin(angle), self.omega * torch.cos(angle)
 
-    def shifted(self, product: Tensor, shift: Tensor, beside: Tensor | None = None) -> Tensor:
-        if not fits(product):
-            return super().shifted(product, shift, beside)
+    def shifted(
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
+    ) -> Tensor:
+        if dropout or not fits(product):
+            return super().shifted(product, shift, beside, dropout)
         return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, False)
 
     def shifted_with_slope(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None
+        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
     ) -> tuple[Tensor, Tensor]:
-        if not fits(product):
-            return super().shifted_with_slope(product, shift, beside)
+        if dropout or not fits(product):
+            return super().shifted_with_slope(product, shift, beside, dropout)
         return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, True)
 
     def monitored(self) -> dict[str, float]:

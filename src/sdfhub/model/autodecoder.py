@@ -64,33 +64,31 @@ class AutoDecoder(L.LightningModule):
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        epoch = self.global_step / max(self.trainer.num_training_batches, 1)
-        loss, parts = self.objective(batch, self.progress, epoch)
+        loss, parts = self.objective(batch, self.progress)
         if not torch.isfinite(loss):
             self._refuse_divergence("loss", parts)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
             self._log(batch, parts, loss)
         return loss
 
-    def objective(self, batch: Batch, progress: float, epoch: float) -> tuple[Tensor, Parts]:
+    def objective(self, batch: Batch, progress: float) -> tuple[Tensor, Parts]:
         """The loss of a batch, which a step lowers, and its weighted parts, whose sum it is.
 
         Args:
             batch: of training shapes.
             progress: share of training done, in [0, 1].
-            epoch: epochs done.
         """
         limit = self.computing.together(batch.sdf.device)
         learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
-        return loss_in_pieces(lambda piece: self._parts(piece, progress, epoch), batch, limit, learned)
+        return loss_in_pieces(lambda piece: self._parts(piece, progress), batch, limit, learned)
 
-    def _parts(self, batch: Batch, progress: float, epoch: float) -> Parts:
+    def _parts(self, batch: Batch, progress: float) -> Parts:
         codes = self.codes(batch.rows)
         predicted = self._value(batch.points, codes)
         gradients = None
         if batch.surface_points.shape[1] and self.loss.wants_gradients(progress):
             _, gradients = self._value_and_gradient(batch.surface_points, codes)
-        return self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, epoch)
+        return self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, progress)
 
     @property
     def progress(self) -> float:

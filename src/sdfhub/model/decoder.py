@@ -7,8 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
-from sdfhub.model.activations import Activation, joined
-from sdfhub.model.dropout import kept
+from sdfhub.model.activations import Activation
 from sdfhub.model.encodings import Encoding
 
 HEAD_SPREAD = 0.03
@@ -139,15 +138,11 @@ class Decoder(nn.Module):
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
         encoded = self.encoding(points)
-        inputs, drops = encoded, self.dropout and self.training
+        inputs, dropout = encoded, self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
             beside = encoded if following.columns[1] else None
-            if drops:
-                hidden = activation.shifted(product, shift)
-                inputs = joined(hidden * kept(hidden, self.dropout), beside)
-            else:
-                inputs = activation.shifted(product, shift, beside)
+            inputs = activation.shifted(product, shift, beside, dropout)
         return self._head(inputs, encoded, codes)
 
     def _head(self, inputs: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
@@ -167,16 +162,11 @@ class Decoder(nn.Module):
             codes: [B, L].
         """
         encoded, to_space = self.encoding.with_pullback(points)
-        inputs, slopes, drops = encoded, [], self.dropout and self.training
+        inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
             beside = encoded if following.columns[1] else None
-            if drops:
-                hidden, slope = activation.shifted_with_slope(product, shift)
-                mask = kept(hidden, self.dropout)
-                inputs, slope = joined(hidden * mask, beside), slope * mask
-            else:
-                inputs, slope = activation.shifted_with_slope(product, shift, beside)
+            inputs, slope = activation.shifted_with_slope(product, shift, beside, dropout)
             slopes.append(slope)
         sdf = self._head(inputs, encoded, codes)
         cotangent = torch.ones_like(sdf)[..., None]

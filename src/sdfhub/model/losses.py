@@ -52,7 +52,7 @@ class SdfLoss:
         delta: clamp of signed distances, normalised frame, > 0.
         lambda_code: weight of the code prior, >= 0.
         code_norm: `squared` for |z|^2 or `l2` for |z|.
-        warmup_epochs: epochs over which lambda_code grows linearly from 0; 0 for none.
+        warmup: share of training in [0, 1] over which lambda_code grows linearly from 0.
         tau: weight of the normal term, >= 0; 0 switches it off.
         tau_start: share of training in [0, 1) before which tau is 0: normals cost time before they pay.
     """
@@ -60,13 +60,15 @@ class SdfLoss:
     delta: float
     lambda_code: float
     code_norm: Literal["squared", "l2"]
-    warmup_epochs: float
+    warmup: float
     tau: float
     tau_start: float = 0.0
 
     def __post_init__(self):
-        if self.delta <= 0 or min(self.lambda_code, self.tau, self.warmup_epochs) < 0:
-            raise ValueError("delta must be positive; lambda_code, tau, warmup_epochs not negative")
+        if self.delta <= 0 or min(self.lambda_code, self.tau) < 0:
+            raise ValueError("delta must be positive; lambda_code and tau not negative")
+        if not 0 <= self.warmup <= 1:
+            raise ValueError(f"warmup must be in [0, 1], got {self.warmup}")
         if not 0 <= self.tau_start < 1:
             raise ValueError(f"tau_start must be in [0, 1), got {self.tau_start}")
 
@@ -81,16 +83,16 @@ class SdfLoss:
         codes: Tensor,
         gradients: Tensor | None,
         normals: Tensor | None,
-        epoch: float,
+        progress: float,
     ) -> dict[str, Tensor]:
         """The weighted parts `sdf`, `code` and, where gradients are given, `normal`; their sum is the loss.
 
         Args:
             predicted: [B, N]; target: [B, N]; codes: [B, L].
             gradients: [B, M, 3] or None; normals: [B, M, 3] or None.
-            epoch: epochs done, for the warm-up of the code prior.
+            progress: share of training done, in [0, 1], for the warm-up of the code prior.
         """
-        warmup = min(1.0, epoch / self.warmup_epochs) if self.warmup_epochs else 1.0
+        warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
         parts = {
             "sdf": clamped_l1(predicted, target, self.delta),
             "code": self.lambda_code * warmup * code_prior(codes, self.code_norm),

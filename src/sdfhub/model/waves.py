@@ -1,45 +1,30 @@
 """sin(omega x) and tanh(beta sin(omega x)) on a processor: one pass over memory forward, one backward.
 
-As tensor operations an activation, its slope and their gradients are some thirty passes over memory, which
-cost as much as the matrix products between them. Here each direction is one loop, which numba compiles when
-it is first used (seconds) and keeps on disk. Backward recomputes from the product: nothing else is kept.
-
-bfloat16 numbers travel as the upper halves of float32 ones; all arithmetic is float32. Sines and hyperbolic
-tangents are polynomials fitted by least squares at Chebyshev nodes: errors below 1e-6.
+Backward recomputes from the product: nothing else is kept. Sines and hyperbolic tangents are polynomials
+fitted by least squares at Chebyshev nodes: errors below 1e-6.
 """
 
-import threading
 from collections.abc import Callable
 
 import numba
 import numpy as np
 import torch
-from llvmlite import binding, ir
-from numba.extending import intrinsic, overload
 from torch import Tensor
 
-ROWS = 128
-"""Points of one shape that a thread works on at a time."""
-
-_LOCK = threading.Lock()
-numba.config.THREADING_LAYER = "workqueue"
-# numba's OpenMP layer would change PyTorch's number of threads; this one takes one caller at a time
-
-_features = binding.get_host_cpu_features()
-if _features.get("avx512f") and not numba.config.CPU_FEATURES:
-    _features["prefer-256-bit"] = False  # LLVM shuns the widest registers; matrix products use them anyway
-    numba.config.CPU_NAME, numba.config.CPU_FEATURES = binding.get_host_cpu_name(), _features.flatten()
+from sdfhub.model.loops import (
+    FAST,
+    ROWS,
+    chunks,
+    flat,
+    narrowed,
+    over_points,
+    result_dtype,
+    widened,
+    with_threads,
+)
 
 _f = np.float32
-_FAST = {"contract", "nsz", "arcp"}
-# no "nnan": a diverged training must show; no "reassoc": it would undo the careful reduction of angles
 _PI, _PI_REST = _f(np.pi), _f(np.pi - np.float64(_f(np.pi)))
-
-
-def fits(product: Tensor) -> bool:
-    """Whether these loops take it: on the CPU, of one of their dtypes, in no graph that is being compiled."""
-    known = product.dtype in (torch.float32, torch.bfloat16)
-    return product.is_cpu and known and product.numel() > 0 and not torch.compiler.is_compiling()
 
 
 class Wave(torch.autograd.Function):
@@ -64,36 +49,34 @@ class Wave(torch.autograd.Function):
         ctx.save_for_backward(product, shift, log_beta)
         shapes, points, width = product.shape
         both = width + (0 if beside is None else beside.shape[2])
-        dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else product.dtype
+        dtype = result_dtype(product)
         value = product.new_empty(shapes, points, both, dtype=dtype)
         slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
-        to_copy = None if beside is None else _flat(beside.to(dtype))
-        results = _flat(value), _flat(slope) if with_slope else None
-        _with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
+        to_copy = None if beside is None else flat(beside.to(dtype))
+        results = flat(value), flat(slope) if with_slope else None
+        with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
         return (value, slope) if with_slope else value
 
     @staticmethod
     def backward(ctx, by_value, by_slope=None):
         product, shift, log_beta = ctx.saved_tensors
-        shapes, points, width = product.shape
+        width = product.shape[2]
         by_beside = by_value[..., width:] if ctx.needs_input_grad[3] else None
         if torch.is_grad_enabled():
             of_wave = _differentiable(ctx, by_value[..., :width], by_slope)
             return *of_wave, by_beside, None, None, None
-        chunks = shapes * -(-points // ROWS)
         by_product = product.new_empty(product.shape)
-        by_shift, by_log_beta = torch.empty(2, chunks, width)
-        cotangents = _flat(by_value), None if by_slope is None else _flat(by_slope)
-        results = _flat(by_product), by_shift.numpy(), by_log_beta.numpy()
-        _with_threads(_backward, *_given(ctx, product, shift, log_beta), *cotangents, *results)
-        by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
+        by_shift, by_log_beta = torch.empty(2, chunks(product), width)
+        cotangents = flat(by_value), None if by_slope is None else flat(by_slope)
+        results = flat(by_product), by_shift.numpy(), by_log_beta.numpy()
+        with_threads(_backward, *_given(ctx, product, shift, log_beta), *cotangents, *results)
         by_log_beta = None if log_beta is None else by_log_beta.sum()
-        return by_product, by_shift, by_log_beta, by_beside, None, None, None
+        return by_product, over_points(by_shift, shift), by_log_beta, by_beside, None, None, None
 
 
 def _given(ctx, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
     beta = None if log_beta is None else _f(log_beta.exp().item())
-    return _flat(product), _flat(shift), product.shape[1], _f(ctx.omega), beta
+    return flat(product), flat(shift), product.shape[1], _f(ctx.omega), beta
 
 
 def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tensor | None]:
@@ -106,59 +89,7 @@ def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tens
     return [next(found) if is_wanted else None for is_wanted in wanted]
 
 
-def _flat(tensor: Tensor) -> np.ndarray:
-    """[rows, W] of the same memory."""
-    rows = tensor.detach().contiguous().view(-1, tensor.shape[-1])
-    return rows.view(torch.uint16).numpy() if rows.dtype == torch.bfloat16 else rows.numpy()
-
-
-def _with_threads(kernel, *arguments) -> None:
-    with _LOCK:
-        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
-        kernel(*arguments)
-
-
-@intrinsic
-def _as_float(context, bits):
-    signature = numba.float32(numba.uint32)
-    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.FloatType())
-
-
-@intrinsic
-def _as_bits(context, number):
-    signature = numba.uint32(numba.float32)
-    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.IntType(32))
-
-
-def _widened(number):
-    """A float32 from a float32 or a bfloat16's bits."""
-
-
-def _narrowed(number, like):
-    """A float32 as what `like` is: itself, or the bits of the nearest bfloat16."""
-
-
-@overload(_widened, inline="always")
-def _(number):
-    if isinstance(number, numba.types.Integer):
-        return lambda number: _as_float(np.uint32(number) << np.uint32(16))
-    return lambda number: number
-
-
-@overload(_narrowed, inline="always")
-def _(number, like):
-    if isinstance(like, numba.types.Integer):
-
-        def rounded(number, like):
-            bits = _as_bits(number)
-            odd = (bits >> np.uint32(16)) & np.uint32(1)
-            return np.uint16((bits + np.uint32(0x7FFF) + odd) >> np.uint32(16))
-
-        return rounded
-    return lambda number, like: number
-
-
-@numba.njit(inline="always", fastmath=_FAST)
+@numba.njit(inline="always", fastmath=FAST)
 def _sin_cos(angle):
     half_turns = np.rint(angle * _f(1 / np.pi))
     rest = (angle - half_turns * _PI) - half_turns * _PI_REST  # in [-pi/2, pi/2]
@@ -171,7 +102,7 @@ def _sin_cos(angle):
     return sine * sign, cosine * sign
 
 
-@numba.njit(inline="always", fastmath=_FAST)
+@numba.njit(inline="always", fastmath=FAST)
 def _tanh(x):
     x = min(max(x, _f(-9)), _f(9))
     s = x * x
@@ -181,7 +112,7 @@ def _tanh(x):
     return x * over / (_f(1) + s * (_f(0.46706504) + s * under))
 
 
-@numba.njit(parallel=True, fastmath=_FAST, cache=True)
+@numba.njit(parallel=True, fastmath=FAST, cache=True)
 def _forward(product, shift, points, omega, beta, beside, value, slope):
     per_shape = -(-points // ROWS)
     for chunk in numba.prange(product.shape[0] // points * per_shape):
@@ -189,20 +120,20 @@ def _forward(product, shift, points, omega, beta, beside, value, slope):
         line = shape if len(shift) > 1 else 0
         for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
             for j in range(product.shape[1]):
-                sine, cosine = _sin_cos(omega * (_widened(product[p, j]) + shift[line, j]))
+                sine, cosine = _sin_cos(omega * (widened(product[p, j]) + shift[line, j]))
                 a, d = sine, omega * cosine
                 if beta is not None:
                     a = _tanh(beta * sine)
                     d = beta * d * (_f(1) - a * a)
-                value[p, j] = _narrowed(a, value[p, j])
+                value[p, j] = narrowed(a, value[p, j])
                 if slope is not None:
-                    slope[p, j] = _narrowed(d, slope[p, j])
+                    slope[p, j] = narrowed(d, slope[p, j])
             if beside is not None:
                 for j in range(beside.shape[1]):
                     value[p, product.shape[1] + j] = beside[p, j]
 
 
-@numba.njit(parallel=True, fastmath=_FAST, cache=True)
+@numba.njit(parallel=True, fastmath=FAST, cache=True)
 def _backward(product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta):
     # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
     # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
@@ -213,13 +144,13 @@ def _backward(product, shift, points, omega, beta, by_value, by_slope, by_produc
         by_shift[chunk], by_log_beta[chunk] = 0, 0
         for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
             for j in range(product.shape[1]):
-                u, cosine = _sin_cos(omega * (_widened(product[p, j]) + shift[line, j]))
+                u, cosine = _sin_cos(omega * (widened(product[p, j]) + shift[line, j]))
                 v = omega * cosine
-                g = _widened(by_value[p, j])
+                g = widened(by_value[p, j])
                 if beta is None:
                     by_x = g * v
                     if by_slope is not None:
-                        by_x -= _widened(by_slope[p, j]) * omega * omega * u
+                        by_x -= widened(by_slope[p, j]) * omega * omega * u
                 else:
                     u, v = beta * u, beta * v
                     a = _tanh(u)
@@ -227,8 +158,8 @@ def _backward(product, shift, points, omega, beta, by_value, by_slope, by_produc
                     by_x = d * g * v
                     by_log_beta[chunk, j] += d * g * u
                     if by_slope is not None:
-                        by_v, bent = d * _widened(by_slope[p, j]), _f(2) * a * v
+                        by_v, bent = d * widened(by_slope[p, j]), _f(2) * a * v
                         by_x -= by_v * (bent * v + omega * omega * u)
                         by_log_beta[chunk, j] += by_v * (v - bent * u)
-                by_product[p, j] = _narrowed(by_x, by_product[p, j])
+                by_product[p, j] = narrowed(by_x, by_product[p, j])
                 by_shift[chunk, j] += by_x

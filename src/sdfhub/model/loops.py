@@ -1,0 +1,106 @@
+"""What compiled loops over a layer's numbers share: dtypes, threads, and how numba is set up.
+
+As tensor operations an activation and its gradient are some thirty passes over memory, which cost as much as
+the matrix products between them. As loops each direction is one pass, which numba compiles when it is first
+used (seconds) and keeps on disk. bfloat16 numbers travel as the upper halves of float32 ones; all arithmetic
+is float32.
+"""
+
+import threading
+
+import numba
+import numpy as np
+import torch
+from llvmlite import binding, ir
+from numba.extending import intrinsic, overload
+from torch import Tensor
+
+ROWS = 128
+"""Points of one shape that a thread works on at a time."""
+
+FAST = {"contract", "nsz", "arcp"}
+"""What a compiler may change. Without "nnan" a diverged training shows; "reassoc" would undo careful sums."""
+
+_LOCK = threading.Lock()
+numba.config.THREADING_LAYER = "workqueue"
+# numba's OpenMP layer would change PyTorch's number of threads; this one takes one caller at a time
+
+_features = binding.get_host_cpu_features()
+if _features.get("avx512f") and not numba.config.CPU_FEATURES:
+    _features["prefer-256-bit"] = False  # LLVM shuns the widest registers; matrix products use them anyway
+    numba.config.CPU_NAME, numba.config.CPU_FEATURES = binding.get_host_cpu_name(), _features.flatten()
+
+
+def fits(product: Tensor) -> bool:
+    """Whether the loops take it: on the CPU, of one of their dtypes, in no graph that is being compiled."""
+    known = product.dtype in (torch.float32, torch.bfloat16)
+    return product.is_cpu and known and product.numel() > 0 and not torch.compiler.is_compiling()
+
+
+def result_dtype(product: Tensor) -> torch.dtype:
+    """The dtype of what a loop makes of a product: its own, or autocast's."""
+    return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else product.dtype
+
+
+def flat(tensor: Tensor) -> np.ndarray:
+    """[rows, W] of the same memory."""
+    rows = tensor.detach().contiguous().view(-1, tensor.shape[-1])
+    return rows.view(torch.uint16).numpy() if rows.dtype == torch.bfloat16 else rows.numpy()
+
+
+def chunks(product: Tensor) -> int:
+    """How many parts of at most ROWS points of one shape a product [B, N, W] has."""
+    return product.shape[0] * -(-product.shape[1] // ROWS)
+
+
+def over_points(by_shift: Tensor, shift: Tensor) -> Tensor:
+    """The gradient by a shift [W] or [B, 1, W], from its parts [chunks, W]."""
+    width = shift.shape[-1]
+    return by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
+
+
+def with_threads(kernel, *arguments) -> None:
+    """Runs a loop with as many threads as PyTorch has."""
+    with _LOCK:
+        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+        kernel(*arguments)
+
+
+@intrinsic
+def _as_float(context, bits):
+    signature = numba.float32(numba.uint32)
+    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.FloatType())
+
+
+@intrinsic
+def _as_bits(context, number):
+    signature = numba.uint32(numba.float32)
+    return signature, lambda context, builder, sig, args: builder.bitcast(args[0], ir.IntType(32))
+
+
+def widened(number):
+    """A float32 from a float32 or a bfloat16's bits."""
+
+
+def narrowed(number, like):
+    """A float32 as what `like` is: itself, or the bits of the nearest bfloat16."""
+
+
+@overload(widened, inline="always")
+def _(number):
+    if isinstance(number, numba.types.Integer):
+        return lambda number: _as_float(np.uint32(number) << np.uint32(16))
+    return lambda number: number
+
+
+@overload(narrowed, inline="always")
+def _(number, like):
+    if isinstance(like, numba.types.Integer):
+
+        def rounded(number, like):
+            bits = _as_bits(number)
+            odd = (bits >> np.uint32(16)) & np.uint32(1)
+            return np.uint16((bits + np.uint32(0x7FFF) + odd) >> np.uint32(16))
+
+        return rounded
+    return lambda number, like: number
