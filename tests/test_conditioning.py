@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from sdfhub.model.decoder import Layer
 from sdfhub.model.film import Film
 from sdfhub.model.fitting import field_and_jacobian
 from sdfhub.tasks.names import flat
@@ -88,3 +89,12 @@ def test_film_has_a_scale_and_a_shift_for_every_unit_of_the_layers_that_hear_the
 def test_concat_adds_no_setting_so_that_earlier_runs_and_sweeps_are_continued():
     assert not [key for key in flat(composed()) if "conditioning" in key]
     assert flat(composed("conditioning=film"))["decoder.conditioning._partial_"] is True
+
+
+def test_a_layer_before_a_film_layer_makes_room_for_the_encoding_alone():
+    """Where layers shorten, those after them read `width` columns; a code that steers is none of them."""
+    settings = {"inject_encoding": [1], "inject_code": [1], "shorten": True, "width": 32, "depth": 2}
+    film, concat = (small_decoder(conditioning=kind, **settings) for kind in (Film, Layer))
+    assert [layer.linear.out_features for layer in film.layers] == [29, 32, 1]
+    assert [layer.linear.out_features for layer in concat.layers] == [25, 32, 1]
+    assert film.layers[1].linear.in_features == concat.layers[1].linear.in_features == 32

@@ -11,6 +11,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.tasks import train as train_task
 from sdfhub.tasks.app import configuration_folder, register_resolvers, run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.evaluate import build_evaluation
 from sdfhub.tasks.run import build_autodecoder
 
 CONF = configuration_folder()
@@ -36,7 +37,7 @@ def parameters(module) -> int:
 def test_every_choice_composes_and_builds(group, choice):
     config = composed(f"{group}={choice}")
     build_autodecoder(config, rows=2)
-    build(config["evaluate"], "evaluate")
+    build_evaluation(config["evaluate"], config["loss"])
     build(config["data"]["preparation"], "data.preparation")
     build(config["data"]["loader"], "data.loader")
     build(config["trainer"], "trainer", within="lightning.pytorch")
@@ -94,7 +95,8 @@ def test_paper_scale_has_a_third_of_deepsdfs_parameters(experiment):
 
 
 def test_evaluation_recipe_at_the_papers_scale_is_the_papers():
-    evaluation = build(composed("scale=paper")["evaluate"], "evaluate")
+    config = composed("scale=paper")
+    evaluation = build_evaluation(config["evaluate"], config["loss"])
     assert evaluation.points == 30_000
     assert (evaluation.fit.steps, evaluation.fit.lr, evaluation.fit.samples) == (800, 5e-3, 8000)
 
@@ -111,6 +113,9 @@ MISTAKES = {
     "activation.betta=3": ["betta", "did you mean 'activation.beta'"],
     "activation.sharpness=3": ["sharpness", "activation.omega_0, activation.omega_hidden", "activation.beta"],
     "+foo=3": ["foo"],
+    "fit.steps=3": ["no key 'fit.steps'", "evaluate.fit.steps"],
+    "scale.omega=3": ["no key 'scale.omega'", "did you mean 'scale.omega_0'"],
+    "trainer.precision=16-mixed": ["16-mixed", "bf16-mixed"],
     "activation.beta=abc": ["activation.beta", "abc"],
     "activation.beta=-1": ["beta", "positive"],
     "optim.lr_decoder=fast": ["optim.lr_decoder", "fast"],
@@ -157,6 +162,19 @@ def test_a_mistake_is_one_line_that_names_it(override, monkeypatch, capsys, tmp_
     assert "Traceback" not in message
     for word in MISTAKES[override]:
         assert word in message
+
+
+@pytest.mark.parametrize("key", ["accumulate_grad_batches=2", "limit_train_batches=5"])
+def test_what_would_change_how_steps_are_counted_is_refused(key, tmp_path):
+    """Draws and schedules count a step a batch, and all batches of an epoch."""
+    name, value = key.split("=")
+    with pytest.raises(SdfhubError, match=rf"trainer\.{name}: .*data\.loader\."):
+        train_task.build_parts(composed(f"+trainer.{name}={value}"), tmp_path)
+
+
+def test_codes_are_fitted_under_the_clamp_of_the_training(tmp_path):
+    config = composed("loss.delta=0.05", "fit=deepsdf")
+    assert train_task.build_parts(config, tmp_path).evaluation.fit.delta == 0.05
 
 
 def test_ctrl_c_is_status_130(monkeypatch, tmp_path):

@@ -222,7 +222,7 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
     ]
     run(["train.py"], *common, "checkpoint.snapshot_every_n_epochs=1", f"output_root={tmp_path / 'whole'}")
     whole = only_run(tmp_path / "whole") / "checkpoints"
-    half = whole / "epoch_0001.ckpt"
+    half = whole / "epoch_0002.ckpt"
     run(
         ["train.py"],
         *common,

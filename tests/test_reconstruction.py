@@ -8,14 +8,14 @@ import torch
 
 from sdfhub.model.fitting import AdamFit
 from sdfhub.model.observed import Problem, Rows, rows_of, violation
-from sdfhub.model.prior import GaussianPrior, Normal, RoundPrior
+from sdfhub.model.prior import GaussianPrior, IsotropicPrior, Normal
 from sdfhub.model.reconstruction import DeepSdfFit, MapFit
 from sdfhub.model.similarity import SIZE, PoseRange, small_similarity, turns
 from sdfhub.shapes import Observation
 from tests.test_fitting import ADAM, decoder  # noqa: F401 - a fixture
 
 MAP = {
-    "prior": RoundPrior(1.0),
+    "prior": IsotropicPrior(1.0),
     "weight": 1e-4,
     "weight_partial": 1e-3,
     "random": 2,

@@ -95,6 +95,19 @@ def test_a_contact_sheet_shows_every_cell_and_says_where_a_surface_is_missing(tm
     assert os.listdir(path.parent) == ["s.png"]
 
 
+def test_a_contact_sheet_of_several_rows_can_name_every_picture(tmp_path):
+    red = np.zeros((40, 40, 3), np.uint8) + np.uint8([200, 30, 30])
+    rows = [[red, red], [red]]
+    heights = {}
+    for captions in (["a", "b"], ["a", "b", "c"]):
+        page = np.asarray(Image.open(contact_sheet(rows, [], captions, tmp_path / "s.png"))).astype(int)
+        assert (page == [200, 30, 30]).all(axis=-1).sum() == 3 * 40 * 40
+        heights[len(captions)] = len(page)
+    dark = (page < 120).all(axis=-1)
+    second_row = (page == [200, 30, 30]).all(axis=-1)[:, 10].nonzero()[0][40]
+    assert heights[3] > heights[2] and dark[second_row - 20 : second_row, :50].any(), "the third one's name"
+
+
 def test_a_contact_sheet_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     def full_disc(*_):
         raise OSError("no space")

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 
 from sdfhub.errors import SdfhubError
 from sdfhub.report.claims import verdicts
@@ -234,7 +235,7 @@ def test_the_papers_own_numbers_bear_out_its_claims_but_two(name, tmp_path):
     others = {claim.text for claim in CLAIMS if claim.sweep not in ("", name)}
     assert all(found[text].state == "not tested" for text in others)
     normals = found["Normals significantly improve the accuracy of SIREN, FFT/SIREN and FFT/HOSC"]
-    assert normals.state == "not tested" and "not there: SIREN, normals off" in normals.figures
+    assert normals.state == "not tested" and "no such row: SIREN, normals off" in normals.figures
 
 
 def test_a_claim_that_needs_all_fails_with_one_figure_and_is_untested_without_it(small):
@@ -256,7 +257,39 @@ def test_rows_of_one_method_are_told_apart_and_common_settings_stand_in_the_titl
     group = only_group(sweep)
     labels = [row.label for row in group.rows]
     assert labels == ["FFT/HOSC + normals (activation.beta=1)", "FFT/HOSC + normals (activation.beta=2)"]
-    assert group.title.endswith("1 shapes, trainer.max_epochs=3")
+    assert group.title.endswith("1 shapes")
+    assert tables(group)[0].notes[-1] == "All rows with trainer.max_epochs=3."
+    for beta in ("1.2345678901", "12345678"):
+        write_cell(
+            sweep, planned("FFT/HOSC", **{"activation.beta": beta, "trainer.max_epochs": "3"}), [0.1e-3]
+        )
+    details = [row.detail for row in only_group(sweep).rows]
+    assert details == [f"activation.beta={beta}" for beta in ("1", "2", "1.23", "1.23e+07")]
+
+
+def test_a_row_without_any_surface_is_no_ones_best_and_tests_no_claim(small):
+    for normals in ("on", "off"):
+        write_cell(small, planned("SIREN", normals), [None, None])
+    group = only_group(small)
+    rows = [row.label for row in group.rows]
+    table = tables(group)[0]
+    assert rows[1:3] == ["SIREN + normals", "SIREN, no normals"]
+    assert not {row for row, _ in table.best} & {1, 2}
+    found = {one.claim.text: one for one in verdicts(group)}
+    alone = found["With a sinusoidal activation alone the method falls short of outperforming DeepSDF"]
+    assert alone.state == "not tested" and "no shape has a surface: SIREN + normals" in alone.figures
+
+
+def test_rows_that_are_equally_good_are_both_the_best(tmp_path):
+    for method in ("SIREN", "FFT/SIREN"):
+        write_cell(tmp_path, planned(method), [0.1e-3, 0.2e-3])
+    assert {row for row, _ in tables(only_group(tmp_path))[0].best} == {0, 1}
+
+
+def test_seconds_of_training_test_no_claim(tmp_path):
+    for method, normals in (("DeepSDF", "off"), ("FFT/SIREN", "on"), ("FFT/HOSC", "on")):
+        write_cell(tmp_path, planned(method, normals, sweep="smoke"), [0.1e-3])
+    assert {one.state for one in verdicts(only_group(tmp_path))} == {"not tested"}
 
 
 def test_a_cell_under_new_defaults_replaces_its_old_one_in_the_plan(tmp_path):
@@ -284,6 +317,26 @@ def test_a_report_says_how_its_sweep_was_made(tmp_path):
     ]
     html = page_of(tmp_path)
     assert "data.x=[1, 2]" in html and "Some CPU | 3" in html
+
+
+def test_augmented_copies_are_drawn_from_and_not_shapes(tmp_path):
+    folder = write_cell(tmp_path, planned("SIREN"), [0.1e-3, 0.1e-3, 0.1e-3])
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["data"]["loader"]["augmentation"] = {"copies": 2}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (cell,) = read_sweep(tmp_path)
+    assert (cell.scores.trained_on, cell.scores.samples) == (3, 50 * 9 * 256)
+
+
+def test_what_was_judged_by_distances_alone_says_so(tmp_path):
+    folder = write_cell(tmp_path, planned("SIREN"), [0.1e-3])
+    metrics = json.loads((folder / "metrics.json").read_text())
+    rows = [{"id": "a", "sdf_error": 0.1, "sign_accuracy": 1.0}]
+    metrics |= {"held_out": {"summary": {}, "shapes": rows}}
+    del metrics["known"]
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    (cell,) = read_sweep(tmp_path)
+    assert cell.state == "failed" and "signed distances alone" in cell.reason
 
 
 def test_a_lock_is_held_once_and_freed(tmp_path):
@@ -323,7 +376,7 @@ def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monk
 
 
 def test_what_is_no_sweep_is_one_line(tmp_path):
-    with pytest.raises(SdfhubError, match="not a sweep's folder"):
+    with pytest.raises(SdfhubError, match="not the folder of a multirun"):
         write_report(tmp_path, tmp_path / "report")
     (tmp_path / PLAN).write_text("{}}")
     with pytest.raises(SdfhubError, match=r"sweep\.json"):

@@ -21,6 +21,7 @@ from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
 from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.cells import finished
+from sdfhub.tasks.evaluate import build_evaluation
 from sdfhub.tasks.names import flat, settings_digest
 from sdfhub.tasks.run import build_autodecoder
 from sdfhub.tasks.sweep import as_planned, jobs
@@ -63,7 +64,7 @@ def test_every_cell_of_a_sweep_composes_and_builds(sweep):
     for _, config in found:
         with torch.device("meta"):  # sizes without the cost of initialisation
             build_autodecoder(config, rows=2)
-        build(config["evaluate"], "evaluate")
+        build_evaluation(config["evaluate"], config["loss"])
         build(config["data"]["loader"], "data.loader")
         build(config["optim"], "optim", within="sdfhub.model")
     assert len({planned.folder for planned, _ in found}) == len(found), "two cells never share a folder"

@@ -9,11 +9,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 _INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
 
+GAP = 4
+"""White between pictures, pixels: what floats beside one shape must not look like its neighbour's."""
+
 
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray | str]],
     row_labels: Sequence[str],
-    column_captions: Sequence[str],
+    captions: Sequence[str],
     path: str | os.PathLike,
 ) -> Path:
     """Lays pictures out as a grid and writes it as one PNG, whole or not at all.
@@ -21,7 +24,7 @@ def contact_sheet(
     Args:
         rows: pictures [S, S, 3] uint8 of one size; a text, such as "no surface", gets a tile that says it.
         row_labels: one text per row; [] for none.
-        column_captions: one text per column, of one or two lines; [] for none.
+        captions: one text per column, or one per picture, of one or two lines; [] for none.
         path: where the PNG goes; its folder is made.
 
     Returns:
@@ -32,23 +35,27 @@ def contact_sheet(
     font = ImageFont.load_default(max(11, size // 14))
     left = int(max((font.getlength(label) for label in row_labels), default=0)) + 20 if row_labels else 6
     line = font.size * 1.35
-    top = (
-        int(line * max(caption.count("\n") + 1 for caption in column_captions)) + 16 if column_captions else 6
+    top = int(line * max(caption.count("\n") + 1 for caption in captions)) + 16 if captions else 6
+    again = top if len(captions) > columns else GAP  # room above the rows below the first
+    lefts = [left + j * (size + GAP) for j in range(columns)]
+    tops = [top + i * (size + again) for i in range(len(rows))]
+    page = Image.new(
+        "RGB", (left + columns * (size + GAP) + 2, top + len(rows) * (size + again) + 2), "white"
     )
-    page = Image.new("RGB", (left + columns * size + 6, top + len(rows) * size + 6), "white")
     draw = ImageDraw.Draw(page)
     for i, row in enumerate(rows):
         for j, image in enumerate(row):
-            x, y = left + j * size, top + i * size
+            x, y = lefts[j], tops[i]
             if isinstance(image, str):
                 _told(draw, image, x, y, size)
             else:
                 page.paste(Image.fromarray(image), (x, y))
     for i, label in enumerate(row_labels):
-        draw.text((10, top + (i + 0.5) * size), label, fill=_INK, font=font, anchor="lm")
-    for j, caption in enumerate(column_captions):
+        draw.text((10, tops[i] + 0.5 * size), label, fill=_INK, font=font, anchor="lm")
+    for number, caption in enumerate(captions):
+        i, j = divmod(number, columns)
         for k, text in enumerate(caption.split("\n")):
-            where = left + (j + 0.5) * size, 8 + (k + 0.5) * line
+            where = lefts[j] + size / 2, tops[i] - top + 8 + (k + 0.5) * line
             draw.text(where, _shortened(text, font, size - 8), fill=_INK, font=font, anchor="mm")
     return write_picture(page, Path(path))
 

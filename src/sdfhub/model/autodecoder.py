@@ -102,10 +102,9 @@ class AutoDecoder(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_before_optimizer_step(self, optimizer) -> None:
-        if getattr(self.trainer.precision_plugin, "scaler", None) is None:  # a scaler skips such steps itself
-            gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
-            if not torch.isfinite(torch.nn.utils.get_total_norm(gradients.values())):
-                self._refuse_divergence("gradient", gradients)
+        gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
+        if not torch.isfinite(torch.nn.utils.get_total_norm(gradients.values())):
+            self._refuse_divergence("gradient", gradients)
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         weights = dict(self.named_parameters())
@@ -117,7 +116,7 @@ class AutoDecoder(L.LightningModule):
         culprits = f"{', '.join(wrong[:3])}{' ...' * (len(wrong) > 3)}" if wrong else "its norm"
         raise SdfhubError(
             f"{what} is not finite at step {self.global_step} ({culprits}): the run diverged; "
-            "lower optim.lr_decoder, activation.omega_0 or activation.beta, or loss.tau"
+            "lower optim.lr_decoder, activation.omega_0, activation.beta or normals.tau"
         )
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:

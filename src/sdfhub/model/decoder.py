@@ -22,7 +22,12 @@ class Layer(nn.Module):
     Args:
         hidden, encoding, code: number of input columns of each part; 0 leaves the part out.
         outputs: number of output features.
+
+    Attributes:
+        joins_code: whether a code is among a layer's inputs, beside the hidden features.
     """
+
+    joins_code = True
 
     def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
         super().__init__()
@@ -74,7 +79,7 @@ class Decoder(nn.Module):
         weight_norm: whether hidden layers are split into direction and length.
         dropout: probability in [0, 1) of dropping a hidden unit while training.
         tanh: whether the output passes through tanh, as in DeepSDF's code.
-        conditioning: makes the layers, and so decides how a code enters them.
+        conditioning: class of the layers, which decides how a code enters them.
     """
 
     def __init__(
@@ -90,7 +95,7 @@ class Decoder(nn.Module):
         weight_norm: bool = True,
         dropout: float = 0.0,
         tanh: bool = False,
-        conditioning: Callable[..., Layer] = Layer,
+        conditioning: type[Layer] = Layer,
     ):
         super().__init__()
         if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
@@ -108,9 +113,8 @@ class Decoder(nn.Module):
         for index in range(depth + 1):
             encoded = encoding.features if index == 0 or index in inject_encoding else 0
             code = code_size if index == 0 or index in inject_code else 0
-            after = encoding.features * (index + 1 in inject_encoding) + code_size * (
-                index + 1 in inject_code
-            )
+            after = encoding.features * (index + 1 in inject_encoding)
+            after += code_size * (index + 1 in inject_code) * conditioning.joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(

@@ -1,8 +1,8 @@
 """Positional encodings gamma(x): points [..., 3] in the unit ball become features [..., F].
 
 Every rival is a module with an attribute `features` (F) and a `forward` that can be differentiated twice,
-because the normal loss differentiates the field's spatial gradient by the weights. Where the Jacobian has a
-short formula, `with_pullback` states it; the others inherit one that asks autograd.
+because the normal loss differentiates the field's spatial gradient by the weights; and `with_pullback`, which
+states its Jacobian.
 """
 
 import math
@@ -30,16 +30,9 @@ class Encoding(nn.Module, ABC):
     def forward(self, points: Tensor) -> Tensor:
         """Encodes points [..., 3], normalised frame, as [..., F]."""
 
+    @abstractmethod
     def with_pullback(self, points: Tensor) -> tuple[Tensor, "Pullback"]:
         """Features [..., F] and the map of a cotangent v [..., F] to J(x)^T v [..., 3], differentiable."""
-        with torch.enable_grad():
-            points = points.detach().requires_grad_()
-            features = self(points)
-
-        def pullback(cotangent: Tensor) -> Tensor:
-            return torch.autograd.grad(features, points, cotangent, create_graph=True)[0]
-
-        return features, pullback
 
 
 Pullback = Callable[[Tensor], Tensor]

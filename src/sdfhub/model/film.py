@@ -20,6 +20,8 @@ class Film(Layer):
         outputs: W, number of output features.
     """
 
+    joins_code = False
+
     def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
         super().__init__(hidden, encoding, 0, outputs)
         self.film = nn.Linear(code, 2 * outputs) if code else None

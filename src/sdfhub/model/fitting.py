@@ -31,10 +31,14 @@ class Fit(Protocol):
 
     Attributes:
         samples: N, signed samples a draw and shape, half of them inside.
+        delta: clamp of distances, normalised frame: the training's.
     """
 
     @property
     def samples(self) -> int: ...
+
+    @property
+    def delta(self) -> float: ...
 
     def __call__(self, decoder: Decoder, draw: Draw, seeds: Sequence[int]) -> Tensor:
         """Codes [B, L] of B shapes, fitted side by side; each depends on its own shape alone.
@@ -59,8 +63,8 @@ class AdamFit:
         samples: N, signed samples a step and shape, half of them inside.
         spread: standard deviation of the initial codes, >= 0.
         lambda_code: weight of the prior, >= 0.
-        delta: clamp of distances, normalised frame, > 0.
         drop_at: share of the steps after which the learning rate is divided by 10.
+        delta: clamp of distances, normalised frame, > 0: the training's.
     """
 
     steps: int
@@ -68,8 +72,8 @@ class AdamFit:
     samples: int
     spread: float
     lambda_code: float
-    delta: float
     drop_at: float = 0.5
+    delta: float = 0.1
 
     def __post_init__(self):
         if min(self.steps, self.samples) < 1 or min(self.lr, self.delta) <= 0:
@@ -111,8 +115,8 @@ class GaussNewtonFit:
         smallest: residual below which |r| is a parabola, normalised frame, > 0.
         spread: standard deviation of the initial codes, >= 0.
         lambda_code: weight of the prior, >= 0.
-        delta: clamp of distances, normalised frame, > 0.
         damping: of the first step, in units of the Hessian's mean diagonal, > 0; large ones start slowly.
+        delta: clamp of distances, normalised frame, > 0: the training's.
     """
 
     steps: int
@@ -122,8 +126,8 @@ class GaussNewtonFit:
     smallest: float
     spread: float
     lambda_code: float
-    delta: float
     damping: float
+    delta: float = 0.1
 
     def __post_init__(self):
         if min(self.steps, self.samples, self.thinning) < 1:

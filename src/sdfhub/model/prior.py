@@ -41,7 +41,7 @@ class Prior(Protocol):
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """The normal distribution of the training codes, its covariance drawn towards a round one.
+    """The normal distribution of the training codes, its covariance shrunk towards an isotropic one.
 
     With S codes of L numbers the sample covariance knows S - 1 directions at best; what it lacks, the
     shrinkage gives.
@@ -49,7 +49,7 @@ class GaussianPrior:
     Source: Ledoit and Wolf 2004, with a given share in place of their estimate.
 
     Args:
-        shrinkage: share of the round covariance (the mean variance in all directions), in (0, 1].
+        shrinkage: share of the isotropic covariance (the mean variance in all directions), in (0, 1].
     """
 
     shrinkage: float
@@ -63,12 +63,12 @@ class GaussianPrior:
         apart = codes - mean
         sample = apart.mT @ apart / max(1, len(codes) - 1)
         variance = sample.diagonal().mean().clamp(min=1e-6)  # one code alone has none
-        round_one = variance * torch.eye(len(mean), dtype=codes.dtype, device=codes.device)
-        return Normal(mean, torch.lerp(sample, round_one, self.shrinkage))
+        isotropic = variance * torch.eye(len(mean), dtype=codes.dtype, device=codes.device)
+        return Normal(mean, torch.lerp(sample, isotropic, self.shrinkage))
 
 
 @dataclass(frozen=True)
-class RoundPrior:
+class IsotropicPrior:
     """N(0, sigma^2) in every direction, whatever the training codes are.
 
     Source: Park et al. 2019, equation 10; sigma = 1 makes the penalty a multiple of mean z^2.

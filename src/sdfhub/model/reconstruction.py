@@ -1,7 +1,7 @@
 """Codes, and poses where these are unknown, of shapes that were observed: MAP estimation with restarts."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -77,8 +77,8 @@ class MapFit:
         tolerance: a descent ends when a step lowers its objective by a smaller share.
         smallest: violation below which it counts squared, normalised frame, > 0; noise raises it.
         blurred: the same while starts descend: a larger one leaves fewer minima to be caught in.
-        delta: clamp of distances, as in training, > 0.
         damping: of the first step, in units of the Hessian's mean diagonal, > 0.
+        delta: clamp of distances, normalised frame, > 0: the training's.
         seed: of the random draws.
     """
 
@@ -94,8 +94,8 @@ class MapFit:
     tolerance: float
     smallest: float
     blurred: float
-    delta: float
     damping: float
+    delta: float = 0.1
     seed: int = 0
 
     def __post_init__(self):
@@ -225,11 +225,13 @@ class DeepSdfFit:
     """DeepSDF's published recipe, the rival: one start, Adam, and signed samples alone.
 
     Args:
-        adam: the recipe.
+        adam: the recipe; its own delta does not count.
+        delta: clamp of distances, normalised frame, > 0: the training's.
         seed: of the initial code and the draws.
     """
 
     adam: AdamFit
+    delta: float = 0.1
     seed: int = 0
 
     def __call__(
@@ -255,11 +257,16 @@ class DeepSdfFit:
         points = torch.from_numpy(observation.points[known])
         sdf = torch.from_numpy((observation.low[known] + observation.high[known]) / 2)
 
+        sides = [side for side in (np.flatnonzero(sdf >= 0), np.flatnonzero(sdf < 0)) if len(side)]
+
         def draw(step: int) -> tuple[Tensor, Tensor]:
-            chosen = np.random.default_rng((self.seed, step)).integers(len(known), size=self.adam.samples)
+            rng = np.random.default_rng((self.seed, step))
+            counts = [len(part) for part in np.array_split(np.empty(self.adam.samples), len(sides))]
+            drawn = [side[rng.integers(len(side), size=n)] for side, n in zip(sides, counts, strict=True)]
+            chosen = np.concatenate(drawn)
             return points[chosen][None], sdf[chosen][None]
 
-        code = self.adam(decoder, draw, [self.seed])
+        code = replace(self.adam, delta=self.delta)(decoder, draw, [self.seed])
         with frozen(decoder), torch.no_grad():
-            rows = rows_of([observation], self.adam.delta, (0.0, 0.0), device)
-            return Fitted(code, violation(decoder, code, rows, self.adam.delta).abs().mean(1))
+            rows = rows_of([observation], self.delta, (0.0, 0.0), device)
+            return Fitted(code, violation(decoder, code, rows, self.delta).abs().mean(1))

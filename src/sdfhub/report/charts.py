@@ -50,7 +50,13 @@ class _Axis:
         low, high = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
         factors = (1, 2, 5) if high - low <= 3 else (1,)
         found = [f * 10.0**k for k in range(low, high + 1) for f in factors]
-        return [value for value in found if self.low <= value <= self.high]
+        found = [value for value in found if self.low <= value <= self.high]
+        return found if len(found) > 1 else [float(f"{value:.2g}") for value in self._spread(4)]
+
+    def _spread(self, count: int) -> list[float]:
+        """Values at even distances, where an axis is too short for round ones."""
+        ratio = self.high / self.low
+        return [self.low * ratio ** ((k + 0.5) / count) for k in range(count)]
 
 
 def line_chart(series: list[Series], x_label: str, y_label: str, height: int = 320) -> Markup:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sdfhub.report.paper import CLAIMS, Below, Claim
-from sdfhub.report.rows import THOUSANDFOLD, Estimate, Group
+from sdfhub.report.rows import THOUSANDFOLD, Estimate, Group, duration
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ def _verdict(claim: Claim, group: Group) -> Verdict:
     sweep = group.choices.get("sweeps", "")
     if not claim.rule:
         return Verdict(claim, "not tested", [])
+    if sweep == "smoke":
+        return Verdict(claim, "not tested", ["sweeps=smoke trains for seconds"])
     if claim.sweep and claim.sweep != sweep:
         return Verdict(claim, "not tested", [f"tested by sweeps={claim.sweep}"])
     outcomes = [_compared(below, group) for below in claim.rule]
@@ -60,7 +62,9 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
         value = row.estimate(below.quantity, below.role) if row else None
         if value is None:
             shown = row.label if row else f"{name[0]}, normals {name[1]}"
-            return None, False, f"not there: {shown}"
+            return None, False, f"no such row: {shown}"
+        if below.quantity in THOUSANDFOLD and not row.has_surfaces(below.role):
+            return None, False, f"no shape has a surface: {row.label}"
         sides.append((row.label, value))
     (left, a), (right, b) = sides
     limit = "" if below.factor == 1 else f"{below.factor:.2g} x "
@@ -82,4 +86,4 @@ def _told(value: Estimate, quantity: str) -> str:
     scaled = value.mean * 1e3 if quantity in THOUSANDFOLD else value.mean
     if quantity == "parameters":
         return f"{scaled:,.0f}"
-    return f"{scaled:.0f} s" if quantity == "seconds" else f"{scaled:.4f}"
+    return duration(scaled) if quantity == "seconds" else f"{scaled:.4f}"

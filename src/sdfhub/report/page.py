@@ -4,7 +4,6 @@ import base64
 import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -13,6 +12,7 @@ from markupsafe import Markup
 from sdfhub.report.charts import Series, line_chart, strip_chart
 from sdfhub.report.claims import Verdict, verdicts
 from sdfhub.report.curves import curve
+from sdfhub.report.origin import installed_version
 from sdfhub.report.pictures import Gallery, Sheet, data_uri
 from sdfhub.report.results import Cell
 from sdfhub.report.rows import Group, Row
@@ -63,7 +63,7 @@ def page(
         name=name,
         counts=_counts(cells),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        version=_version(),
+        version=installed_version("sdfhub"),
         parts=parts,
         meshes=meshes,
         origin=origin,
@@ -130,10 +130,3 @@ def _template():
 
 def _text(name: str) -> str:
     return files("sdfhub.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _version() -> str:
-    try:
-        return version("sdfhub")
-    except PackageNotFoundError:  # run from a folder without an installation
-        return "(not installed)"

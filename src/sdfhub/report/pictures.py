@@ -61,8 +61,11 @@ class Gallery:
         truth = [Tile(self._truth_image(id), "", "no truth") for _, id in shown]
         rows = [("Ground truth", truth)] if any(tile.image is not None for tile in truth) else []
         for row in group.rows:
-            if row.done:
-                rows.append((row.label, [self._tile(row, role, id) for role, id in shown]))
+            absent = Tile(
+                None, "", "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
+            )
+            tiles = [self._tile(row, role, id) if row.done else absent for role, id in shown]
+            rows.append((row.label, tiles))
         return Sheet(columns, rows)
 
     def extremes(self, group: Group) -> Sheet:

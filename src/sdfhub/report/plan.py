@@ -65,7 +65,8 @@ def read_plan(sweep: Path) -> Plan:
         return Plan.model_validate_json((sweep / PLAN).read_bytes())
     except OSError as error:
         raise SdfhubError(
-            f"{sweep}: not a sweep's folder ({PLAN}: {(error.strerror or 'unreadable').lower()})"
+            f"{sweep}: not the folder of a multirun, such as outputs/sweeps/table_small "
+            f"({PLAN}: {(error.strerror or 'unreadable').lower()})"
         ) from error
     except ValidationError as error:
         first = error.errors()[0]

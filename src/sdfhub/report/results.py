@@ -62,9 +62,14 @@ class _Metrics(_Read):
     held_out: _Role | None = None
 
 
+class _Augmentation(_Read):
+    copies: int = 0
+
+
 class _Loader(_Read):
     shapes_per_step: int
     samples_per_shape: int
+    augmentation: _Augmentation = _Augmentation()
 
 
 class _Data(_Read):
@@ -93,7 +98,7 @@ class Scores:
         training: its cost.
         epochs: passes that the trainer was asked for.
         samples: signed samples drawn in all.
-        trained_on: shapes in the code table.
+        trained_on: training shapes, without augmented copies.
         config: the content of `config.yaml`.
     """
 
@@ -154,7 +159,7 @@ def read_scores(folder: Path) -> Scores:
         SdfhubError: a file is missing, broken or not what training writes.
     """
     content = _loaded(folder / "metrics.json")
-    if "sdf_error" in json.dumps(content.get("known", {}))[:2000]:
+    if any("sdf_error" in json.dumps(content.get(role, {}))[:2000] for role in ROLES):
         raise SdfhubError("judged by signed distances alone: its source holds no meshes")
     metrics = _checked(_Metrics, content, "metrics.json")
     raw = _loaded(folder / "config.yaml")
@@ -163,7 +168,8 @@ def read_scores(folder: Path) -> Scores:
     if metrics.training is None:
         raise SdfhubError("metrics.json: says nothing about a training")
     loader = config.data.loader
-    drawn = metrics.training.steps * min(loader.shapes_per_step, shapes) * loader.samples_per_shape
+    rows = shapes * (1 + loader.augmentation.copies)
+    drawn = metrics.training.steps * min(loader.shapes_per_step, rows) * loader.samples_per_shape
     roles = {role: getattr(metrics, role).shapes for role in ROLES if getattr(metrics, role)}
     return Scores(roles, metrics.training, config.trainer.max_epochs, drawn, shapes, raw)
 

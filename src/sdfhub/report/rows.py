@@ -75,6 +75,10 @@ class Row:
     def done(self) -> list[Cell]:
         return [cell for cell in self.cells if cell.scores]
 
+    def has_surfaces(self, role: str = "known") -> bool:
+        """Whether any judged shape has a surface: without one CD is a penalty, which says nothing."""
+        return any(not shape.failed for cell in self.done for shape in cell.scores.shapes.get(role, []))
+
     def estimate(self, quantity: str, role: str = "known") -> Estimate | None:
         """A quantity over the finished seeds; None where no seed has it.
 
@@ -122,14 +126,13 @@ class Group:
 
     @cached_property
     def title(self) -> str:
-        """`chairs, data=open, scale=cpu, 20 shapes`."""
+        """`chairs, data=open, scale=cpu, 20 shapes`; settings of all rows stand below a table."""
         shapes = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
         counted = (
             [f"{' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))} shapes"] if shapes else []
         )
         named = [f"{name}={self.choices[name]}" for name in ("data", "scale") if name in self.choices]
-        said = [f"{key}={value}" for key, value in self.settings.items()]
-        return ", ".join([self.choices.get("category", "all"), *named, *counted, *said])
+        return ", ".join([self.choices.get("category", "all"), *named, *counted])
 
     def row(self, method: str, normals: str) -> Row | None:
         """The row of that method without further detail, if it is there."""
@@ -186,4 +189,20 @@ def _detail(key: tuple, namesakes: list[tuple]) -> str:
     """Settings of the row's own, and choices only where rows of its name differ in them."""
     own, others = key
     common = set.intersection(*(set(k[1]) for k in namesakes))
-    return ", ".join(f"{name}={value}" for name, value in [*own, *(p for p in others if p not in common)])
+    told = [*own, *(pair for pair in others if pair not in common)]
+    return ", ".join(f"{name}={_shortened(value)}" for name, value in told)
+
+
+def _shortened(value: str) -> str:
+    """A number of more than six characters to three digits: a search draws them with sixteen."""
+    try:
+        return f"{float(value):.3g}" if len(value) > 6 else value
+    except ValueError:
+        return value
+
+
+def duration(seconds: float) -> str:
+    """`4.8 s`, `48 s`, `12.5 min`, `30.2 h`."""
+    if seconds < 120:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

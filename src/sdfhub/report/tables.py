@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from sdfhub.report.claims import verdicts
 from sdfhub.report.paper import COSTS, PRINTED
 from sdfhub.report.results import ROLES
-from sdfhub.report.rows import Estimate, Group, Row
+from sdfhub.report.rows import Estimate, Group, Row, duration
 
 NONE = "–"
 """An empty cell of a table."""
@@ -57,6 +57,8 @@ def _scores(group: Group, role: str) -> Table:
         "samplings of the truth. Shapes without a surface count with the CD of a single point. "
         "± is a 95% confidence interval over seeds (Student's t)."
     ]
+    if group.settings:
+        notes.append(f"All rows with {', '.join(f'{key}={value}' for key, value in group.settings.items())}.")
     title = f"{TITLES[role]}: {group.title}"
     return Table(title, [*head, *rivals], rows, notes, _best(group, role))
 
@@ -87,16 +89,18 @@ def _ratio(group: Group, row: Row, quantity: str, role: str = "known") -> str:
     """The row's value over DeepSDF's; none where that says nothing (an excess at or below 0)."""
     rival = group.deepsdf.estimate(quantity, role) if group.deepsdf else None
     own = row.estimate(quantity, role)
-    return f"{own.mean / rival.mean:.3g}" if own and rival and rival.mean > 0 else NONE
+    return f"{own.mean / rival.mean:.3g}" if own and rival and min(own.mean, rival.mean) > 0 else NONE
 
 
 def _best(group: Group, role: str) -> frozenset[tuple[int, int]]:
     """Row and column of the lowest value of each quantity but the floor, which is no row's merit."""
     found = set()
     for column, quantity in enumerate(QUANTITIES, start=1):
-        values = {k: e.mean for k, row in enumerate(group.rows) if (e := row.estimate(quantity, role))}
-        if len(values) > 1 and quantity != "floor_mean":
-            found.add((min(values, key=values.get), column))
+        rows = [(k, row) for k, row in enumerate(group.rows) if row.has_surfaces(role)]
+        values = {k: row.estimate(quantity, role).mean for k, row in rows}
+        if len(group.rows) > 1 and values and quantity != "floor_mean":
+            best = min(values.values())
+            found |= {(k, column) for k, value in values.items() if value == best}
     return frozenset(found)
 
 
@@ -140,13 +144,6 @@ def claims_table(group: Group) -> Table:
         for one in verdicts(group)
     ]
     return Table(f"Claims of the paper: {group.title}", ["claim", "source", "verdict", "figures"], rows, [])
-
-
-def duration(seconds: float) -> str:
-    """`4.8 s`, `48 s`, `12.5 min`, `30.2 h`."""
-    if seconds < 120:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _thousandth(value: Estimate | None) -> str:

@@ -83,6 +83,7 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except KeyboardInterrupt:
+        print("sdfhub: interrupted", file=sys.stderr)
         sys.exit(130)
     except Exception as error:
         error = told_by_plugin(error) or error
@@ -158,6 +159,10 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     text = text.split(" Config search path:")[0].split(" full_key:")[0].split(" See https://hydra.cc")[0]
     if "hydra/sweeper/optuna'" in text:
         return "search: needs Optuna; pip install 'sdfhub[optuna]'"
+    if "hydra/launcher/ray'" in text:
+        return "hydra/launcher=ray: is not installed here; pip install hydra-ray-launcher"
+    if text.startswith("Ambiguous value"):
+        return f"{text} To train one after another, add -m."
     unknown = re.match(r"Could not override '([^']+)'", text)
     missing = re.match(r"Missing mandatory value: (\S+)", text)
     if missing:
@@ -171,10 +176,10 @@ def _no_such_key(key: str, config_name: str = "config") -> str:
     if below and group in groups:
         keys = _keys_of(group)
         near = get_close_matches(key, keys, n=1, cutoff=0.85)
-        hint = f"did you mean {near[0]!r}?" if near else f"{group} has {', '.join(keys)}"
+        hint = f"did you mean {near[0]!r}?" if near else f"{group} sets {', '.join(keys)}"
         return f"there is no key {key!r}; {hint}"
     own = [] if config_name == "config" else _top_level_keys(config_name)
-    near = get_close_matches(key, own or groups, n=1)
+    near = get_close_matches(key, own or [*groups, *_top_level_keys("config")], n=1)
     choices = f"the keys are {', '.join(own)}" if own else f"the groups are {', '.join(groups)}"
     hint = f"did you mean {near[0]!r}?" if near else choices
     return f"there is no group or key {key!r}; {hint}"
@@ -203,11 +208,20 @@ def _groups() -> list[str]:
 
 
 def _keys_of(group: str) -> list[str]:
-    """Dotted keys of all choices of a group."""
-    paths = sorted((configuration_folder() / group).glob("*.yaml"))
-    nodes = [_yaml(path) for path in paths] + [_yaml(configuration_folder() / "config.yaml").get(group, {})]
-    found = dict.fromkeys(f"{group}.{key}" for node in nodes for key in _leaves(node))
-    return [key for key in found if not key.endswith(("_target_", "_partial_", "defaults"))]
+    """Dotted keys that the choices of a group set, where they lie: those of `fit` below `evaluate.fit`."""
+    found = {
+        f"{group}.{key}": None
+        for key in _leaves(_yaml(configuration_folder() / "config.yaml").get(group, {}))
+    }
+    for path in sorted((configuration_folder() / group).glob("*.yaml")):
+        named = re.match(r"# @package (\S+)", path.read_text(encoding="utf-8"))
+        package = named.group(1) if named else group
+        prefix = "" if package == "_global_" else f"{package}."
+        found |= {f"{prefix}{key}": None for key in _leaves(_yaml(path))}
+    unset = ("_target_", "_partial_", "defaults")
+    found = [key for key in found if not key.endswith(unset) and not key.startswith("hydra.")]
+    own = [key for key in found if key.startswith(f"{group}.")]  # a scale sets much that is not its own
+    return own or found
 
 
 def _leaves(node: dict, prefix: str = "") -> list[str]:

@@ -24,7 +24,8 @@ TENSORBOARD_VERTICES = 60_000
 class TrainingRecord(L.Callback):
     """Seconds, steps and the loss at both ends of a training, for `metrics.json`.
 
-    What an interrupted training had gathered by its last checkpoint counts when it is continued.
+    The clock starts after the first step of a process, in which loops are compiled. What an interrupted
+    training had gathered by its last checkpoint counts when it is continued.
     """
 
     ENDS = 20
@@ -39,10 +40,11 @@ class TrainingRecord(L.Callback):
         self.stepped = False  # by this process
 
     def on_train_start(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        self._trainer, self._started = trainer, time.perf_counter()
+        self._trainer = trainer
 
     def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
-        self.stepped = True
+        if not self.stepped:
+            self.stepped, self._started = True, time.perf_counter()
         loss = float(outputs["loss"])
         self._last.append(loss)
         if len(self._first) < self.ENDS:

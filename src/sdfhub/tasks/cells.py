@@ -16,8 +16,8 @@ from sdfhub.tasks.build import plain
 from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
-UNTOLD_GROUPS = ("callbacks", "trainer", "tuned")
-"""Groups that say where and how watched a cell runs, or follow from the others."""
+UNTOLD_GROUPS = ("callbacks", "tuned")
+"""Groups that say how watched a cell is, or follow from the others."""
 
 
 def run_cell(

@@ -29,7 +29,13 @@ class WholeFileIO(TorchCheckpointIO):
 
 
 class Snapshots(ModelCheckpoint):
-    """Checkpoints that stay. A class of its own: Lightning tells the states of callbacks apart by class."""
+    """Checkpoints that stay, named after the epochs done: Lightning counts them from 0.
+
+    A class of its own, since Lightning tells the states of callbacks apart by class.
+    """
+
+    def format_checkpoint_name(self, metrics: dict[str, Any], *args: Any, **kwargs: Any) -> str:
+        return super().format_checkpoint_name(metrics | {"epoch": metrics["epoch"] + 1}, *args, **kwargs)
 
 
 class KeepLast(L.Callback):

@@ -73,6 +73,20 @@ class Evaluation:
             raise ValueError("known, held_out, pictures and workers must not be negative")
 
 
+def build_evaluation(node: dict[str, Any], loss: dict[str, Any]) -> Evaluation:
+    """How a run is judged. Codes are fitted under the clamp of the training.
+
+    Args:
+        node: config of the evaluation.
+        loss: config of the loss that the run was, or is to be, trained with.
+
+    Raises:
+        SdfhubError: a setting is wrong.
+    """
+    delta = check(loss["delta"], float, "loss.delta")
+    return build(node | {"fit": node["fit"] | {"delta": delta}}, "evaluate")
+
+
 def evaluate_model(
     decoder: Decoder,
     codes: Tensor,
@@ -105,7 +119,8 @@ def evaluate_model(
         fitted = fit_held_out(decoder, unseen, evaluation)
         roles += [("held_out", shape, code) for shape, code in zip(unseen, fitted, strict=True)]
     if any(shape.mesh is None for _, shape, _ in roles):
-        rows = [(role, shape, distance_errors(decoder, code, shape)) for role, shape, code in roles]
+        delta = evaluation.fit.delta
+        rows = [(role, shape, distance_errors(decoder, code, shape, delta)) for role, shape, code in roles]
         return write_distances(rows, training, out)
     return write_scores(judge_all(decoder, roles, evaluation), evaluation, training, out)
 
@@ -158,9 +173,7 @@ def judge_all(
 
 
 @torch.inference_mode()
-def distance_errors(
-    decoder: Decoder, code: Tensor, shape: StoredShape, delta: float = 0.1
-) -> dict[str, float]:
+def distance_errors(decoder: Decoder, code: Tensor, shape: StoredShape, delta: float) -> dict[str, float]:
     """How far the field is from a shape's own samples, up to 100,000 a side.
 
     Returns:
@@ -183,8 +196,8 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     """Judges a finished run again, as `config` says, into `out` or a folder `evaluation` of the run."""
     run = Path(check(config["run"], str, "run"))
     out = check(config["out"], Path | None, "out") or run / "evaluation"
-    evaluation = build(config["evaluate"], "evaluate")
     trained, roles_then = read_run(run)
+    evaluation = build_evaluation(config["evaluate"], trained["loss"])
     space = load(run)
     refuse_unwritable(out)
     data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}

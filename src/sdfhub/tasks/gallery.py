@@ -40,7 +40,7 @@ def write_gallery(
     ]
     columns = len(shown) if animated else COLUMNS
     rows = [shown[start : start + columns] for start in range(0, len(shown), columns)]
-    contact_sheet(rows, [], captions if len(rows) == 1 else [], out / "strip.png")
+    contact_sheet(rows, [], captions, out / "strip.png")
     for index, mesh in enumerate(meshes):
         write_mesh(*mesh, out / "meshes" / f"{index:03d}.ply")
     write_row(meshes, space.up, out / "meshes.glb")

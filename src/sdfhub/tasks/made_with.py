@@ -2,11 +2,12 @@
 
 import platform
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
 from lightning.pytorch import Trainer
+
+from sdfhub.report.origin import installed_version
 
 PACKAGES = ("sdfhub", "torch", "lightning", "numpy")
 
@@ -17,20 +18,13 @@ def made_with(trainer: Trainer) -> dict[str, str]:
     is_cpu = device.type == "cpu"
     return {
         "python": ".".join(map(str, sys.version_info[:3])),
-        **{name: _version(name) for name in PACKAGES},
+        **{name: installed_version(name) for name in PACKAGES},
         "system": f"{platform.system()} {platform.machine()}",
         "device": _processor() if is_cpu else torch.cuda.get_device_name(device),
         "threads": str(torch.get_num_threads()),
         "processes": str(trainer.world_size),
         "precision": str(trainer.precision),
     }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # run from a folder without an installation
-        return "not installed"
 
 
 def _processor() -> str:

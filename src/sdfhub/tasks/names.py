@@ -11,8 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
 
 WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
-WHERE_NOT_WHAT += ("data.loader.workers", "search.", "trainer.enable_", "trainer.log_every_n_steps")
-WHERE_NOT_WHAT += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
+WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "data.source.root", "computing.", "search.")
+WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
+WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
+WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes")
 """Settings that say where and how watched a cell runs; its result is the same under any of them."""
 
 

@@ -23,7 +23,7 @@ from sdfhub.model.reconstruction import Method
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
 from sdfhub.tasks.app import configuration_folder
-from sdfhub.tasks.build import build
+from sdfhub.tasks.build import build, check
 from sdfhub.tasks.run import build_decoder, plain_frames, put_weights, read_run, read_weights
 from sdfhub.whole_file import write_whole
 
@@ -50,8 +50,9 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")
     about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
-    where, (evidence, method) = _device(device), default_fitting()
+    where = _device(device)
     try:
+        evidence, method = default_fitting(clamp(about["config"]))
         ids = tuple(about["ids"])
         frames = about["frames"].items()
         return Space(
@@ -98,15 +99,24 @@ def trained_decoder(node: Mapping[str, Any], weights: Mapping[str, Tensor], path
     return decoder.requires_grad_(False)
 
 
-def default_fitting() -> tuple[Evidence, Method]:
-    """What `sdfhub reconstruct` takes by default: the evidence of a scan, and the method."""
+def clamp(config: Mapping[str, Any]) -> float:
+    """delta, within which a run learned distances, as its config says; codes are fitted under the same."""
+    return check(config["loss"]["delta"], float, "loss.delta")
+
+
+def default_fitting(delta: float) -> tuple[Evidence, Method]:
+    """What `sdfhub reconstruct` takes by default: the evidence of a scan, and the method.
+
+    Args:
+        delta: clamp of distances.
+    """
     evidence, method, prior = (
         yaml.safe_load((configuration_folder() / file).read_text(encoding="utf-8"))
         for file in ("reconstruct.yaml", "method/map.yaml", "prior/gaussian.yaml")
     )
     return (
         build(evidence["evidence"], "evidence", within="sdfhub.data"),
-        build(method | {"prior": prior}, "method", within="sdfhub.model"),
+        build(method | {"prior": prior, "delta": delta}, "method", within="sdfhub.model"),
     )
 
 

@@ -17,7 +17,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, Limits, calibrated
-from sdfhub.tasks.opening import beside, load
+from sdfhub.tasks.opening import beside, clamp, load
 from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table, write_found
 from sdfhub.tasks.run import leave_no_empty_folder, read_run, refuse_unwritable
 
@@ -69,7 +69,7 @@ def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
     return Reconstructor(
         space,
         likely=prior(space.codes),
-        method=build(config["method"], "method", within="sdfhub.model"),
+        method=build(config["method"], "method", within="sdfhub.model", delta=clamp(space.config)),
         evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
         frame=frame,
         poses=poses if frame == "unknown" else None,

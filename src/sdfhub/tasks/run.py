@@ -92,9 +92,8 @@ def build_decoder(node: Mapping[str, Any]) -> Decoder:
     """
     given = {}
     if "conditioning" in node:  # the decoder's own way is not written down
-        given["conditioning"] = build(
-            node["conditioning"] or {}, "decoder.conditioning", within="sdfhub.model.film"
-        )
+        conditioning = build(node["conditioning"] or {}, "decoder.conditioning", within="sdfhub.model.film")
+        given["conditioning"] = conditioning.func  # the class: it has no settings
     for part, within in (("encoding", "sdfhub.model.encodings"), ("activation", "sdfhub.model.activations")):
         given[part] = build(node.get(part) or {}, f"decoder.{part}", within=within)
     rest = {key: value for key, value in node.items() if key not in given}

@@ -24,9 +24,9 @@ from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.callbacks import LossBar, LossLines, TrainingRecord
 from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
-from sdfhub.tasks.evaluate import Evaluation, evaluate_model
+from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
-from sdfhub.tasks.names import flat
+from sdfhub.tasks.names import WHERE_NOT_WHAT, flat
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
@@ -40,11 +40,7 @@ from sdfhub.tasks.run import (
 )
 from sdfhub.tasks.search import objective
 
-FREE_TO_CHANGE = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "evaluate.", "data.store")
-FREE_TO_CHANGE += ("computing.", "data.workers", "data.loader.workers", "data.loader.resident")
-FREE_TO_CHANGE += ("data.source.root", "data.source.up")
-FREE_TO_CHANGE += ("trainer.max_", "trainer.enable_", "trainer.log_every_n_steps")
-FREE_TO_CHANGE += ("trainer.accelerator", "trainer.devices", "trainer.strategy", "trainer.num_nodes")
+FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""
 
 
@@ -91,7 +87,9 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         return {}
     training = parts.record.summary(model) | {"made_with": made_with(trainer)}
     if not parts.record.stepped:
-        print(f"nothing was left to train in {parts.resume_from}: raise trainer.max_epochs to go on")
+        print(
+            f"{parts.resume_from}: its training was finished (trainer.max_epochs would prolong it); judging"
+        )
     known = dict(enumerate(prepared.train))
     codes = model.codes.table.detach()
     metrics = evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
@@ -138,7 +136,7 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     if bar:  # in a file a bar is ten thousand lines
         callbacks.append(LossBar() if watched else LossLines())
     return Parts(
-        evaluation=build(config["evaluate"], "evaluate"),
+        evaluation=build_evaluation(config["evaluate"], config["loss"]),
         loading=build(config["data"]["loader"], "data.loader"),
         trainer=build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks),
         record=record,
@@ -192,14 +190,29 @@ def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
 
 
 def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
-    """The trainer, or one line that says what it cannot do on this machine."""
+    """The trainer, or one line that says what it cannot do on this machine, or would do wrongly.
+
+    Raises:
+        SdfhubError: names the setting.
+    """
     make = build(node, "trainer", within="lightning.pytorch")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     try:
-        return make(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
+        trainer = make(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
     except (ValueError, TypeError, MisconfigurationException) as error:
         hint = "; trainer=auto takes what this machine has" if "ccelerator" in str(error) else ""
         raise SdfhubError(f"trainer: {error}{hint}") from error
+    if trainer.accumulate_grad_batches != 1:  # large batches are worked on in pieces anyway
+        raise SdfhubError(
+            "trainer.accumulate_grad_batches: a step is one batch; raise data.loader.samples_per_shape"
+        )
+    if trainer.limit_train_batches != 1.0:  # schedules and draws count all steps of an epoch
+        raise SdfhubError(
+            "trainer.limit_train_batches: an epoch has data.loader.passes_per_epoch passes; set that"
+        )
+    if getattr(trainer.precision_plugin, "scaler", None) is not None:  # pieces are differentiated unscaled
+        raise SdfhubError(f"trainer.precision={trainer.precision}: gradients would underflow; use bf16-mixed")
+    return trainer
 
 
 def main() -> None:
@@ -208,12 +221,15 @@ def main() -> None:
     warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
     # a continued run has a folder of its own
     warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
+    warnings.filterwarnings("ignore", ".*Checkpoint directory .* exists and is not empty.*")
     # our loader starts from the step that a checkpoint ends with, in the middle of an epoch too
     warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
     warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
+        if all(hydra.runtime.choices.get(group) for group in ("sweeps", "search")):
+            raise SdfhubError("search= and sweeps=: a search is no table; leave one of them out")
         if hydra.mode == RunMode.MULTIRUN:
             return objective(run_cell(train, config, hydra))
         for group in ("sweeps", "search"):

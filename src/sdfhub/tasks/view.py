@@ -4,8 +4,8 @@ import threading
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge, Le
 from omegaconf import DictConfig
+from pydantic import Field
 
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
@@ -16,8 +16,8 @@ from sdfhub.tasks.opening import load
 def view(config: dict[str, Any]) -> None:
     """The task: `config` as conf/view.yaml has it. Returns when the process is interrupted."""
     run = check(config["run"], str, "run")
-    port = check(config["port"], Annotated[int, Ge(0), Le(65535)], "port")
-    resolution = check(config["resolution"], Annotated[int, Ge(8), Le(512)], "resolution")
+    port = check(config["port"], Annotated[int, Field(ge=0, le=65535)], "port")
+    resolution = check(config["resolution"], Annotated[int, Field(ge=8, le=512)], "resolution")
     try:
         from sdfhub.tasks.viewer import Viewer
     except ImportError as error:
