@@ -46,6 +46,8 @@ def judged(folder: Path, scores: Scores | None) -> dict[str, float | None]:
 def read_search(folder: Path) -> list[Trial]:
     """A search's finished and failed trials, the best first, then the defaults where they are there."""
     cells = [cell for cell in read_sweep(folder) if cell.state != "missing"]
+    if not all("search" in cell.plan.choices for cell in cells):
+        raise SdfhubError(f"{folder}: not a search; `sdfhub report` tells what a sweep found")
     said = [cell.plan.settings for cell in cells]
     searched = [key for key in said[0] if len({settings.get(key) for settings in said}) > 1] if said else []
     found = [

@@ -99,7 +99,7 @@ class AdamFit:
 
 @dataclass(frozen=True)
 class GaussNewtonFit:
-    """Damped Gauss-Newton steps on one draw of samples, first on a few of them, then on all.
+    """Damped Gauss-Newton steps on one draw of samples: on a few of them, then on more, then on all.
 
     A code has some hundred numbers and a shape thousands of residuals, so a step can solve for the code
     instead of following its gradient; some twenty do what Adam needs hundreds for. The absolute value enters
@@ -110,7 +110,7 @@ class GaussNewtonFit:
     Args:
         steps: most steps of a pass, >= 1.
         samples: N, signed samples a shape, half of them inside; drawn once.
-        thinning: the first pass sees every so many-th sample, >= 1.
+        thinning: the first pass sees every so many-th sample, the second every root of it, >= 1.
         tolerance: a pass of a shape ends when a step lowers its objective by a smaller share.
         smallest: residual below which |r| is a parabola, normalised frame, > 0.
         spread: standard deviation of the initial codes, >= 0.
@@ -148,7 +148,7 @@ class GaussNewtonFit:
 
     def _fit(self, decoder, codes: Tensor, points: Tensor, sdf: Tensor) -> Tensor:
         damping = torch.full_like(codes[:, 0], self.damping)
-        for every in (self.thinning, 1):
+        for every in sorted({self.thinning, math.isqrt(self.thinning), 1}, reverse=True):
 
             def about(shapes: Tensor, at: Tensor, some: slice = slice(None, None, every)) -> Quadratic:
                 return self._about(decoder, points[shapes, some], sdf[shapes, some], at)
