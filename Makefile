@@ -11,7 +11,7 @@ DEV_STAMP := $(VENV)/.installed-dev
 help: ## list these targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
 
-install: $(STAMP) ## make .venv and install into it what constraints.txt pins; extras are not among it
+install: $(STAMP) ## install sdfhub into .venv with the versions of constraints.txt, without extras
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -3,7 +3,7 @@
 Each rival is a module with three duties: `forward`; `with_slope`, the same beside its derivative, from which
 the decoder computes spatial gradients; and `weight_bound`, the half-width of the uniform distribution from
 which the weights of the linear layer before it are drawn. `shifted` is where a rival may be faster than its
-plain formula: it adds what a layer owes to its shape's code and applies the activation.
+plain formula: it adds the code's share of the layer's output and applies the activation.
 """
 
 import math

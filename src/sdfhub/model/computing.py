@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
-"""Samples worked on together: what stays near a processor's caches; what fills a GPU and not its memory."""
+"""Samples worked on together: what stays in a CPU's caches; what fills a GPU and not its memory."""
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of options in glibc's malloc.h

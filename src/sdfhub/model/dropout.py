@@ -8,7 +8,7 @@ from torch import Tensor
 def kept(hidden: Tensor, dropout: float) -> Tensor:
     """Dropout's factors: 0 with probability `dropout`, rounded to 2^-16, else its inverse; like `hidden`.
 
-    On a processor from 16 random bits a number: there PyTorch's own draw takes longer than a layer's product.
+    On the CPU from 16 random bits a number: there PyTorch's own draw takes longer than a layer's product.
     """
     if not hidden.is_cpu or torch.compiler.is_compiling():
         return F.dropout(torch.ones_like(hidden), dropout)

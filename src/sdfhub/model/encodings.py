@@ -190,7 +190,7 @@ class Hash(Encoding):
     def _encode(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """Features and what they are made of, for P points in all, K levels and C features a level.
 
-        Points are the last axis while it is worked on: long rows are what a processor is fast at.
+        Points are the last axis while it is worked on: long rows are what a CPU is fast at.
 
         Returns:
             features: [..., F].

@@ -1,4 +1,4 @@
-"""How fast what is learned: one Adam, a learning rate per group, and schedules over the share of training."""
+"""The optimiser: Adam with a learning rate per group, and schedules over the share of training."""
 
 import math
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
 """A large batch in pieces: the gradient of the whole in the memory of a part.
 
 DeepSDF's paper batch is a million points; the activations of all of them at once would take tens of
-gigabytes, and on a processor even a few thousand leave its caches.
+gigabytes, and on a CPU even a few thousand leave its caches.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""max(0, x) with dropout on a processor: one pass over memory forward, one backward.
+"""max(0, x) with dropout on the CPU: one pass over memory forward, one backward.
 
 A unit passes gradients exactly where its output is not 0, so backward needs nothing but the output. Which
 units are dropped is a hash of their place and of a number that PyTorch's generator draws.

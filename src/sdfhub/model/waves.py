@@ -1,4 +1,4 @@
-"""sin(omega x) and tanh(beta sin(omega x)) on a processor: one pass over memory forward, one backward.
+"""sin(omega x) and tanh(beta sin(omega x)) on the CPU: one pass over memory forward, one backward.
 
 Backward recomputes from the product: nothing else is kept. Sines and hyperbolic tangents are polynomials
 fitted by least squares at Chebyshev nodes: errors below 1e-6.
