@@ -18,8 +18,9 @@ CONF = configuration_folder()
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
 OTHER_TASKS = ("method", "prior")
 """Groups of `sdfhub reconstruct` alone."""
+TUNED = sorted(path.stem for path in (CONF / "tuned").glob("*.yaml"))
 ALL_CHOICES = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-CHOICES = [(group, choice) for group, choice in ALL_CHOICES if group not in OTHER_TASKS]
+CHOICES = [(group, choice) for group, choice in ALL_CHOICES if group not in (*OTHER_TASKS, "tuned")]
 
 
 def composed(*overrides: str, config_name: str = "config"):
@@ -47,6 +48,36 @@ def test_every_choice_composes_and_builds(group, choice):
         build(config["data"]["source"], "data.source")
     except SdfhubError as error:  # a source whose root is not on this machine says so
         assert config["data"]["source"].get("root", "?") in str(error)
+
+
+def choices_of(tuned: str) -> list[str]:
+    """The choices after which a file of settings is named."""
+    words, rest = [], tuned
+    for group in ("scale", "decoder", "activation", "encoding"):
+        fitting = [
+            choice for owner, choice in CHOICES if owner == group and f"{rest}_".startswith(f"{choice}_")
+        ]
+        words.append(max(fitting, key=len))
+        rest = rest[len(words[-1]) + 1 :]
+    assert not rest
+    return words
+
+
+@pytest.mark.parametrize("tuned", TUNED)
+def test_settings_of_a_search_are_taken_with_the_choices_that_it_was_made_for(tuned):
+    scale, decoder, activation, encoding = choices_of(tuned)
+    choices = [f"scale={scale}", f"decoder={decoder}", f"activation={activation}", f"encoding={encoding}"]
+    found, without = composed(*choices), composed(*choices, "~tuned")
+    assert found == composed(*choices, f"tuned={tuned}") != without
+    build_autodecoder(found, rows=2)
+    mine = composed(*choices, "optim.lr_decoder=7e-5", "normals.tau=0.03", "scale.omega_0=9")
+    assert (mine["optim"]["lr_decoder"], mine["loss"]["tau"]) == (7e-5, 0.03)
+    assert mine["activation"].get("omega_0", 9) == 9
+
+
+def test_normals_off_stay_off_under_settings_of_a_search():
+    config = composed("scale=demo", "activation=hosc", "encoding=fourier", "normals=off")
+    assert config["loss"]["tau"] == 0 and config["activation"]["beta"] == 1.6
 
 
 @pytest.mark.parametrize(("group", "choice"), [pair for pair in ALL_CHOICES if pair[0] in OTHER_TASKS])
@@ -115,6 +146,8 @@ MISTAKES = {
     "+foo=3": ["foo"],
     "fit.steps=3": ["no key 'fit.steps'", "evaluate.fit.steps"],
     "scale.omega=3": ["no key 'scale.omega'", "did you mean 'scale.omega_0'"],
+    "tuned=null": ["a group takes", "~GROUP"],
+    "seed=0,1": ["Ambiguous value", "add -m"],
     "trainer.precision=16-mixed": ["16-mixed", "bf16-mixed"],
     "activation.beta=abc": ["activation.beta", "abc"],
     "activation.beta=-1": ["beta", "positive"],

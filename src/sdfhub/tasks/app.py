@@ -161,6 +161,8 @@ def one_line(error: Exception, config_name: str = "config") -> str:
         return "search: needs Optuna; pip install 'sdfhub[optuna]'"
     if "hydra/launcher/ray'" in text:
         return "hydra/launcher=ray: is not installed here; pip install hydra-ray-launcher"
+    if text.startswith("Config group override must be"):
+        return "a group takes the name of one of its choices; ~GROUP leaves it out"
     if text.startswith("Ambiguous value"):
         return f"{text} To train one after another, add -m."
     unknown = re.match(r"Could not override '([^']+)'", text)

@@ -195,6 +195,8 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     Raises:
         SdfhubError: names the setting.
     """
+    if str(node.get("precision")).startswith("16"):  # pieces of a batch are differentiated unscaled
+        raise SdfhubError(f"trainer.precision={node['precision']}: gradients would underflow; use bf16-mixed")
     make = build(node, "trainer", within="lightning.pytorch")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     try:
@@ -210,8 +212,6 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
         raise SdfhubError(
             "trainer.limit_train_batches: an epoch has data.loader.passes_per_epoch passes; set that"
         )
-    if getattr(trainer.precision_plugin, "scaler", None) is not None:  # pieces are differentiated unscaled
-        raise SdfhubError(f"trainer.precision={trainer.precision}: gradients would underflow; use bf16-mixed")
     return trainer
 
 
