@@ -149,6 +149,7 @@ MISTAKES = {
     "tuned=null": ["a group takes", "~GROUP"],
     "seed=0,1": ["Ambiguous value", "add -m"],
     "trainer.precision=16-mixed": ["16-mixed", "bf16-mixed"],
+    "trainer.precision=bf16-true": ["bf16-true", "bf16-mixed"],
     "activation.beta=abc": ["activation.beta", "abc"],
     "activation.beta=-1": ["beta", "positive"],
     "optim.lr_decoder=fast": ["optim.lr_decoder", "fast"],

@@ -8,7 +8,9 @@ import trimesh
 
 from sdfhub.data.ac3d import read_ac3d
 from sdfhub.data.mesh import FORMATS, read_mesh
+from sdfhub.data.sources.folder import FolderSource
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.tasks.mesh_file import write_mesh
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -206,3 +208,29 @@ def test_ac3d_believes_no_claims(claim):
 def test_ac3d_nests_only_so_deep():
     with pytest.raises(RejectedMesh, match="deep"):
         read_ac3d(b"AC3Db\n" + b"OBJECT group\nkids 1\n" * 5000)
+
+
+@pytest.mark.parametrize("away", [0.0, 4e6])
+def test_a_written_ply_keeps_the_digits_of_its_coordinates(away, tmp_path):
+    """A scan in geographic coordinates: some metres, millions of metres from the origin."""
+    vertices = np.asarray(BALL.vertices) * 5 + away
+    write_mesh(vertices, np.asarray(BALL.faces), tmp_path / "ball.ply")
+    found, faces = read_mesh(tmp_path / "ball.ply")
+    assert np.abs(found - vertices).max() < 1e-5
+    assert np.array_equal(faces, BALL.faces)
+
+
+def test_a_banner_of_comments_before_an_off_takes_no_time(tmp_path):
+    """A pattern that backtracks would take longer than anyone waits."""
+    (tmp_path / "ball.off").write_bytes(b"#" * 5000 + b"\n" + BALL.export(file_type="off").encode())
+    try:
+        assert len(read_mesh(tmp_path / "ball.off")[1]) == len(BALL.faces)
+    except RejectedMesh as rejection:  # trimesh may not know comments; it must say so at once
+        assert rejection.reason == "corrupt_file"
+
+
+@pytest.mark.parametrize("uri", [None, 7, "a\0b"])
+def test_a_gltf_with_a_senseless_buffer_does_not_keep_a_folder_from_being_listed(uri, tmp_path):
+    (tmp_path / "bad.gltf").write_text(json.dumps({"buffers": [{"uri": uri}]}))
+    (tmp_path / "good.off").write_text(BALL.export(file_type="off"))
+    assert len(FolderSource(str(tmp_path)).shapes()) == 2

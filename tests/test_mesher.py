@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry import marching, mesher
 from sdfhub.geometry.coarse_to_fine import Judged, judge_blocks
+from sdfhub.geometry.grid import Grid
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
 from sdfhub.geometry.metrics import is_closed
 
@@ -298,3 +299,9 @@ def test_a_slice_keeps_the_order_of_its_axes():
     assert values.shape == (33, 33)
     assert values[0, -1] == pytest.approx(25 - 1 + 10, abs=1e-4)  # x = -1, z = 1
     assert values[-1, 0] == pytest.approx(25 + 1 - 10, abs=1e-4)  # x = 1, z = -1
+
+
+def test_nodes_beyond_two_thousand_million_lie_where_they_are():
+    """Keys of a grid of 1300 points an axis do not fit 32 bits."""
+    grid = Grid(lambda points, shapes: points[..., 0], range(1), 1300, 1.0, 4096, torch.device("cpu"))
+    assert grid.evaluate(np.array([0, 1300**3 - 1], np.int64)).tolist() == [-1, 1]

@@ -204,6 +204,10 @@ def test_deepsdfs_recipe_takes_samples_and_nothing_else(decoder):  # noqa: F811
     vague = Observation(vague.points, vague.low, vague.high + np.float32(0.1), vague.unsigned)
     with pytest.raises(ValueError, match="signed samples"):
         rival(decoder, CODES, [vague])
+    seen = ball(0.5)
+    seen = Observation(seen.points, 0 * seen.low, 0 * seen.high, seen.unsigned)
+    with pytest.raises(ValueError, match="signed samples"):
+        rival(decoder, CODES, [seen])
     with pytest.raises(ValueError, match="poses"):
         rival(decoder, CODES, [ball(0.5)], POSES)
 

@@ -216,3 +216,38 @@ def test_a_scan_that_does_not_fit_its_frame_says_what_would(box, points, sensor,
     scan = Scan(cloud(box, 200)[0] * points, sensor=sensor)
     with pytest.raises(SdfhubError, match=words):
         observed(scan, Evidence(**EVIDENCE), frame, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("count", [4096, 65_536])
+def test_the_outside_does_not_leak_into_a_dense_cloud_nor_into_one_whose_points_come_twice(count):
+    """Points of a sphere's surface closer together than the flood's cells, or each given twice."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(count, 3))
+    points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
+    twice = np.repeat(points[: count // 2], 2, axis=0)
+    for cloud in (points, twice):
+        target = observed(Scan(cloud), Evidence(**EVIDENCE), "normalised", np.random.default_rng(1))
+        seen = target.observation
+        inside = np.linalg.norm(seen.points, axis=1) < 0.7
+        assert inside.sum() > 50 and seen.unsigned[inside].all(), "none is surely outside"
+
+
+def test_a_cloud_of_few_different_points_is_refused():
+    points = np.repeat(np.random.default_rng(0).uniform(-1, 1, (30, 3)), 3, axis=0)
+    with pytest.raises(SdfhubError, match="30 different points"):
+        observed(Scan(points), Evidence(**EVIDENCE), "shape", np.random.default_rng(0))
+
+
+def test_normals_of_any_length_are_directions():
+    points = np.random.default_rng(0).normal(size=(60, 3))
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(Scan(points, 5 * normals).normals, normals)
+
+
+@pytest.mark.parametrize(
+    "part", [{"center": np.zeros((1, 3))}, {"center": np.full(3, np.nan)}, {"scale": 0.0}]
+)
+def test_a_frame_that_is_none_is_refused(part):
+    points = np.random.default_rng(0).uniform(-1, 1, (60, 3))
+    with pytest.raises(ValueError, match=next(iter(part))):
+        Scan(points, sdf=points[:, 0], **part)

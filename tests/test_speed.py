@@ -325,3 +325,11 @@ def test_computing_takes_what_suits_the_device():
         assert torch.get_float32_matmul_precision() == "medium"
     finally:
         torch.set_float32_matmul_precision("highest")
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
+def test_a_shift_of_another_number_of_shapes_is_refused_not_read_beyond_its_end(activation):
+    product, shift = products()
+    for wrong in (shift[:2], torch.zeros(21)):
+        with pytest.raises(ValueError, match="does not fit"):
+            activation.shifted(product, wrong)

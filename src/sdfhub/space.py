@@ -151,6 +151,10 @@ class Space:
             what = f"points {list(points.shape)} and codes {list(codes.shape)}"
             raise SdfhubError(f"sdf takes points [N, 3] of one shape or [B, N, 3] of B shapes, got {what}")
         points, codes = (points[None], codes[None]) if is_one else (points, codes)
+        if len(points) != len(codes):
+            raise SdfhubError(f"sdf: points of {len(points)} shapes, but codes of {len(codes)}")
+        if not points.numel():
+            return points.new_zeros(points.shape[1:-1] if is_one else points.shape[:-1])
         parts = [points]
         if not (torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)):
             together = max(1, Computing().together(self.device) // len(points))

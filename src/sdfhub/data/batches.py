@@ -152,5 +152,7 @@ def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> 
 
 def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
     """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
+    if count and not shape.rows(name):
+        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
     start = int(rng.integers(shape.rows(name))) if count else 0
     return shape.read(name, start, count)

@@ -14,6 +14,9 @@ ENOUGH = 8192
 QUIETEST, SHARE = 0.3, 0.817
 """Places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)."""
 
+EDGE = 1.2
+"""Half the edge of the cube in which the outside is flooded, normalised frame."""
+
 
 def spacing_of(points: np.ndarray) -> float:
     """Median distance from a point of [N, 3] to its nearest neighbour, in its units."""
@@ -50,13 +53,18 @@ def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> 
         reach: how near is near; more than the gaps between points, less than the parts between them.
         cells: of the cube along an axis.
     """
-    axis = np.linspace(-1.2, 1.2, cells)
+    axis = np.linspace(-EDGE, EDGE, cells)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     tree = cKDTree(points)
     near = np.isfinite(tree.query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
     pieces, _ = label(~near)
-    cell = np.rint((at + 1.2) / 2.4 * (cells - 1)).astype(np.int64).clip(0, cells - 1)
+    cell = np.rint((at + EDGE) / (2 * EDGE) * (cells - 1)).astype(np.int64).clip(0, cells - 1)
     return pieces[tuple(cell.T)] == pieces[0, 0, 0]
+
+
+def cell_radius(cells: int) -> float:
+    """Half the diagonal of a cell of the flood's cube, normalised frame: the least reach that stops it."""
+    return 3**0.5 * EDGE / (cells - 1)
 
 
 def areas_of(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sdfhub.data.cloud import areas_of, is_outside, noise_of, spacing_of, tangent_planes, winding
+from sdfhub.data.cloud import areas_of, cell_radius, is_outside, noise_of, spacing_of, tangent_planes, winding
 from sdfhub.data.free_space import free_space
 from sdfhub.shapes import Observation
 
@@ -91,7 +91,9 @@ class Evidence:
         most = distance
         if noise:  # the nearest of many scattered points lies nearer than the surface
             least, most = np.maximum(distance - noise, 0), distance + 3 * noise
-        outside, inside = self._sides(points, normals, at, max(SEALED * spacing, 3 * noise))
+        # a wall thinner than the flood's own cells would let it through
+        reach = max(SEALED * spacing, 3 * noise, cell_radius(self.cells))
+        outside, inside = self._sides(points, normals, at, reach)
         low = np.where(outside, least, -most)
         high = np.where(inside, -least, most)
         unsigned = ~outside & ~inside

@@ -77,7 +77,7 @@ def _check_length(content: bytes, suffix: str) -> None:
         promised = sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE)))
         held = _lines(body)
     elif suffix == ".off":
-        counts = re.match(rb"(?:\s|#.*)*OFF(?:\s|#.*)+(\d+)\s+(\d+)(?:[ \t]+\d+)?", content)
+        counts = re.match(rb"(?:\s|#[^\n]*\n)*OFF(?:\s|#[^\n]*\n)+(\d+)\s+(\d+)(?:[ \t]+\d+)?", content)
         promised = sum(map(int, counts.groups())) if counts else 0
         held = _lines(content[counts.end() :]) if counts else 0
     if promised > held:

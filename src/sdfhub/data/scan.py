@@ -26,7 +26,7 @@ class Scan:
 
     Args:
         points: [N, 3] float64: vertices, surface points, or places of signed samples.
-        normals: [N, 3] float64 unit normals of surface points, outward; None where not known.
+        normals: [N, 3] float64 outward normals of surface points, made unit; None where not known.
         faces: [F, 3] int64 rows of `points`, of a mesh; else None.
         sdf: [N] float64 of signed samples, negative inside, normalised frame; else None.
         sensor: [3] float64, the place from which all points were seen; None where not known.
@@ -47,17 +47,27 @@ class Scan:
             raise ValueError(f"points must be [N, 3] numbers, they are {list(self.points.shape)}")
         if len(self.points) < LEAST and self.faces is None:
             raise ValueError(f"holds {len(self.points)} points; at least {LEAST} are needed to know a shape")
-        for name, shape in (("normals", self.points.shape), ("sdf", self.points.shape[:1]), ("sensor", (3,))):
+        for name, shape in (
+            ("normals", self.points.shape),
+            ("sdf", self.points.shape[:1]),
+            ("sensor", (3,)),
+            ("center", (3,)),
+        ):
             part = getattr(self, name)
             if part is not None and part.shape != shape:
                 raise ValueError(f"{name} must be {list(shape)} numbers, they are {list(part.shape)}")
-        for name in ("points", "normals", "sdf", "sensor"):
+        for name in ("points", "normals", "sdf", "sensor", "center"):
             part = getattr(self, name)
             bad = 0 if part is None else int((~np.isfinite(part)).sum())
             if bad:
                 raise ValueError(f"{bad} numbers of its {name} are not finite; remove those points")
-        if self.normals is not None and not (np.linalg.norm(self.normals, axis=1) > 0).all():
-            raise ValueError("some of its normals are zero; remove them, or all normals")
+        if self.normals is not None:
+            lengths = np.linalg.norm(self.normals, axis=1, keepdims=True)
+            if not (lengths > 0).all():
+                raise ValueError("some of its normals are zero; remove them, or all normals")
+            object.__setattr__(self, "normals", self.normals / lengths)
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale must be a positive number, it is {self.scale}")
         if self.sdf is not None and not (self.sdf.min() < 0 <= self.sdf.max()):
             raise ValueError("its signed distances are all on one side; both sides are needed")
 
@@ -138,11 +148,7 @@ def _cloud(rows: np.ndarray) -> Scan:
     if rows.ndim != 2 or rows.shape[1] not in (3, 6):
         raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
     rows = rows.astype(np.float64)
-    return Scan(rows[:, :3], _unit(rows[:, 3:]) if rows.shape[1] == 6 else None)
-
-
-def _unit(normals: np.ndarray) -> np.ndarray:
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
 
 
 def _text(path: Path) -> Scan:
@@ -176,8 +182,7 @@ def _archive(path: Path) -> Scan:
     if "sdf" in parts:
         center, scale = parts.get("center", np.zeros(3)), parts.get("scale", np.ones(1))
         return _samples(parts["points"], parts["sdf"], center, float(scale.ravel()[0]))
-    normals = parts.get("normals")
-    return Scan(parts["points"], None if normals is None else _unit(normals), sensor=parts.get("sensor"))
+    return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))
 
 
 def _samples(points: np.ndarray, sdf: np.ndarray, center: np.ndarray, scale: float) -> Scan:

@@ -8,7 +8,7 @@ import numpy as np
 from sdfhub.data.evidence import Evidence
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.sampling import prepare_mesh
-from sdfhub.data.scan import Scan
+from sdfhub.data.scan import LEAST, Scan
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import RADIUS, Observation
 
@@ -74,12 +74,24 @@ def observed(scan: Scan, evidence: Evidence, frame: Frame, rng: np.random.Genera
         observation = evidence.of_samples(points, scan.sdf, rng)
         center, scale = (scan.center, scan.scale) if scan.center is not None else (center, scale)
     elif scan.sensor is not None:
-        points, normals = thinned(points, scan.normals, rng)
+        points, normals = thinned(*distinct(points, scan.normals), rng)
         observation = evidence.of_view(points, normals, (scan.sensor - center) * scale, rng)
     else:
-        points, normals = thinned(points, scan.normals, rng)
+        points, normals = thinned(*distinct(points, scan.normals), rng)
         observation = evidence.of_cloud(points, normals, rng)
     return Target("samples" if scan.sdf is not None else scan.kind, len(points), observation, center, scale)
+
+
+def distinct(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Each place of points [N, 3] once, with its first normal: repeated ones would look infinitely dense.
+
+    Raises:
+        SdfhubError: too few are left.
+    """
+    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if len(rows) < LEAST:
+        raise SdfhubError(f"holds {len(rows)} different points; at least {LEAST} are needed to know a shape")
+    return points[rows], None if normals is None else normals[rows]
 
 
 def thinned(

@@ -65,7 +65,7 @@ class Grid:
         nodes = self.n**3
         first = np.searchsorted(keys, nodes * np.arange(len(self.shapes) + 1))
         place, shapes = _tiled(np.diff(first))
-        tiles = np.zeros((len(shapes), TILE), np.int32)
+        tiles = np.zeros((len(shapes), TILE), np.int32 if nodes < 2**31 else np.int64)
         tiles.reshape(-1)[place] = keys - np.repeat(nodes * np.arange(len(self.shapes)), np.diff(first))
         values = np.empty(tiles.shape, np.float32)
         together = max(1, self.batch // TILE)

@@ -48,6 +48,18 @@ def flat(tensor: Tensor) -> np.ndarray:
     return rows.view(torch.uint16).numpy() if rows.dtype == torch.bfloat16 else rows.numpy()
 
 
+def flat_shift(shift: Tensor, product: Tensor) -> np.ndarray:
+    """[B, W] or [1, W] of the same memory as a shift [B, 1, W] or [W] of a product [B, N, W].
+
+    Raises:
+        ValueError: it is of other shapes; a loop would read beyond its end.
+    """
+    rows = flat(shift)
+    if rows.shape not in ((1, product.shape[2]), (product.shape[0], product.shape[2])):
+        raise ValueError(f"a shift {list(shift.shape)} does not fit products {list(product.shape)}")
+    return rows
+
+
 def chunks(product: Tensor) -> int:
     """How many parts of at most ROWS points of one shape a product [B, N, W] has."""
     return product.shape[0] * -(-product.shape[1] // ROWS)

@@ -252,17 +252,16 @@ class DeepSdfFit:
 
     def _fit(self, decoder: Decoder, observation: Observation, device: torch.device) -> Fitted:
         known = np.flatnonzero((observation.high - observation.low <= KNOWN) & ~observation.unsigned)
-        if not len(known):
-            raise ValueError("DeepSDF's recipe needs signed samples; use method=map")
         points = torch.from_numpy(observation.points[known])
         sdf = torch.from_numpy((observation.low[known] + observation.high[known]) / 2)
-
-        sides = [side for side in (np.flatnonzero(sdf >= 0), np.flatnonzero(sdf < 0)) if len(side)]
+        outside, inside = np.flatnonzero(sdf > 0), np.flatnonzero(sdf < 0)
+        if not (len(outside) and len(inside)):
+            raise ValueError("DeepSDF's recipe needs signed samples; use method=map")
 
         def draw(step: int) -> tuple[Tensor, Tensor]:
             rng = np.random.default_rng((self.seed, step))
-            counts = [len(part) for part in np.array_split(np.empty(self.adam.samples), len(sides))]
-            drawn = [side[rng.integers(len(side), size=n)] for side, n in zip(sides, counts, strict=True)]
+            half = self.adam.samples // 2
+            drawn = rng.choice(outside, self.adam.samples - half), rng.choice(inside, half)
             chosen = np.concatenate(drawn)
             return points[chosen][None], sdf[chosen][None]
 

@@ -13,6 +13,7 @@ from sdfhub.model.loops import (
     ROWS,
     chunks,
     flat,
+    flat_shift,
     narrowed,
     over_points,
     result_dtype,
@@ -44,7 +45,12 @@ class Rectifier(torch.autograd.Function):
         dtype = result_dtype(product)
         value = product.new_empty(shapes, points, both, dtype=dtype)
         slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
-        given = flat(product), flat(shift), points, None if beside is None else flat(beside.to(dtype))
+        given = (
+            flat(product),
+            flat_shift(shift, product),
+            points,
+            None if beside is None else flat(beside.to(dtype)),
+        )
         drops = (_u(round(dropout * 2**32)), _seed()) if dropout else (None, None)
         ctx.factor, ctx.width = 1 / (1 - dropout), width
         results = flat(value), None if slope is None else flat(slope)

@@ -16,6 +16,7 @@ from sdfhub.model.loops import (
     ROWS,
     chunks,
     flat,
+    flat_shift,
     narrowed,
     over_points,
     result_dtype,
@@ -76,7 +77,7 @@ class Wave(torch.autograd.Function):
 
 def _given(ctx, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
     beta = None if log_beta is None else _f(log_beta.exp().item())
-    return flat(product), flat(shift), product.shape[1], _f(ctx.omega), beta
+    return flat(product), flat_shift(shift, product), product.shape[1], _f(ctx.omega), beta
 
 
 def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tensor | None]:

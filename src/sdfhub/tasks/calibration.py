@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sdfhub.data.evidence import Evidence
-from sdfhub.data.scan import Scan
+from sdfhub.data.scan import LEAST, Scan
 from sdfhub.data.scanning import surface_scan, view_scan
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
@@ -32,6 +32,9 @@ NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
 DISTANCE, HEIGHT = 2.5, 0.5
 """Of simulated sensors from the origin, and how far up they may stand, as a sine."""
 PIXELS = 100
+LOOKS = 20
+"""Places tried for a sensor, until it sees enough points to know a shape."""
+
 VIEWS = 2
 """Simulated of each shape: what one leaves depends on where the sensor stood."""
 
@@ -122,8 +125,12 @@ class Alike:
         if mesh is None:
             raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")
         if self.kind == "view":
-            sensor = random_sensor(rng, shape.up)
-            return Scan(view_scan(mesh, sensor, PIXELS, self.noise, rng), sensor=sensor)
+            for _ in range(LOOKS):
+                sensor = random_sensor(rng, shape.up)
+                points = view_scan(mesh, sensor, PIXELS, self.noise, rng)
+                if len(points) >= LEAST:  # a rod seen along its axis shows less
+                    return Scan(points, sensor=sensor)
+            raise SdfhubError(f"{shape.id}: is too thin to be seen from anywhere")
         points, normals = surface_scan(mesh, self.count, self.noise, rng)
         return Scan(points, normals if self.kind == "oriented" else None)
 

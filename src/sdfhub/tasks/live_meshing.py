@@ -78,6 +78,8 @@ class LiveMesher:
                 pass
             except SdfhubError as error:
                 self.show(error)
+            except Exception as error:  # such as no memory left: the page must hear of it, and go on
+                self.show(SdfhubError(f"{type(error).__name__}: {error}"))
 
     def _refine(self, code: Tensor, about: Any, asked: float) -> None:
         for index, resolution in enumerate(self.resolutions):

@@ -11,6 +11,10 @@ from sdfhub.whole_file import write_whole
 FORMATS = ("ply", "obj", "glb")
 """What meshes can be written as."""
 
+FAR = 16
+"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it: scans
+in geographic coordinates lie far beyond. GLB knows no others; OBJ is text."""
+
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
     """Writes a mesh in the format of the path's suffix, whole or not at all; nothing where it has no faces.
@@ -20,10 +24,23 @@ def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
         faces: [F, 3].
         path: ends in one of FORMATS.
     """
-    if len(faces):
+    size = np.ptp(vertices, axis=0).max() if len(faces) else 0
+    if len(faces) and path.suffix == ".ply" and np.abs(vertices).max() > FAR * size:
+        write_whole(path, _ply_of_doubles(vertices, faces))
+    elif len(faces):
         import trimesh  # here: slow to import, and every training would wait for it before its first step
 
         _write(trimesh.Trimesh(vertices, faces, process=False), path)
+
+
+def _ply_of_doubles(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """A binary PLY with 64-bit coordinates, which trimesh does not write."""
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    head += [f"property double {axis}" for axis in "xyz"]
+    head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, faces
+    return "\n".join(head).encode() + np.asarray(vertices, "<f8").tobytes() + rows.tobytes()
 
 
 def write_row(meshes: Sequence[Mesh], up: str, path: Path) -> None:

@@ -180,7 +180,10 @@ def reconstruct_targets(
         try:
             yield from _reconstruct_group(how, {name: targets[name] for name in group}, limits, out)
         except SdfhubError as error:
-            yield from (Found(name, reason=str(error)) for name in group)
+            if len(group) == 1:
+                yield Found(group[0], reason=str(error))
+            else:  # which of them it is shows when each is alone
+                yield from reconstruct_targets(how, {name: targets[name] for name in group}, limits, out, 1)
 
 
 def _reconstruct_group(

@@ -44,6 +44,11 @@ FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.up", "trainer.max_"
 """Settings under which a run may be continued though it was started with others."""
 
 
+OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "transformer-engine")
+"""What Lightning offers and we do not: pieces of a batch are differentiated without a loss scale, and the
+loops know float32 and bfloat16."""
+
+
 @dataclass(frozen=True)
 class Parts:
     """What a config describes, built and so checked before the first shape is prepared."""
@@ -195,8 +200,8 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     Raises:
         SdfhubError: names the setting.
     """
-    if str(node.get("precision")).startswith("16"):  # pieces of a batch are differentiated unscaled
-        raise SdfhubError(f"trainer.precision={node['precision']}: gradients would underflow; use bf16-mixed")
+    if str(node.get("precision")) in OTHER_PRECISIONS:
+        raise SdfhubError(f"trainer.precision={node['precision']}: use 32-true or bf16-mixed")
     make = build(node, "trainer", within="lightning.pytorch")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     try:

@@ -79,7 +79,7 @@ def _fingerprint(file: Path) -> str:
         return digest
     try:
         names = [buffer.get("uri", "") for buffer in json.loads(file.read_bytes()).get("buffers", [])]
-    except (ValueError, AttributeError):
+        buffers = [buffer_path(file.parent, name) for name in names if not name.startswith("data:")]
+    except (ValueError, AttributeError, TypeError):
         return digest  # reading it will say what is wrong
-    buffers = [buffer_path(file.parent, name) for name in names if not name.startswith("data:")]
     return hashlib.sha256("".join([digest, *(file_sha256(b) for b in buffers if b)]).encode()).hexdigest()
