@@ -70,6 +70,8 @@ class Preparation:
             ("variances", len(self.variances) > 0 and min(self.variances) > 0, "positive numbers"),
             ("surface_points", self.surface_points >= 0, "at least 0"),
             ("views", self.views >= 8, "at least 8"),
+            ("min_faces", self.min_faces >= 0, "at least 0"),
+            ("max_components", self.max_components >= 1, "at least 1"),
         ):
             if not valid:
                 raise SdfhubError(f"preparation.{name}={getattr(self, name)}: must be {wanted}")
