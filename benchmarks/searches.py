@@ -5,8 +5,8 @@
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
 
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. The
-objective is what the search lowered: the geometric mean of known and held-out shapes' median excess CD; all
-three times 10^3. Settings are those in which the trainings of a search differ.
+objective is what a search lowers: the geometric mean of mean and median excess CD of known and of held-out
+shapes. Beside it both means and medians; all times 10^3. Settings are those in which trainings differ.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import csv
 import io
 import json
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import NamedTuple
 
 from sdfhub.errors import SdfhubError
@@ -23,7 +23,7 @@ from sdfhub.tasks.names import flat
 from sdfhub.tasks.search import objective
 from sdfhub.whole_file import write_whole
 
-SCORES = ("objective", "known", "held_out", "seconds")
+SCORES = ("objective", "known", "known_median", "held_out", "held_out_median", "seconds")
 
 
 class Trial(NamedTuple):
@@ -38,7 +38,10 @@ def judged(folder: Path, scores: Scores | None) -> dict[str, float | None]:
     """SCORES of a training's folder."""
     if scores is None:
         return dict.fromkeys(SCORES)
-    excess = {role: median(shape.excess for shape in shapes) * 1e3 for role, shapes in scores.shapes.items()}
+    excess = {}
+    for role, shapes in scores.shapes.items():
+        values = [shape.excess * 1e3 for shape in shapes]
+        excess |= {role: mean(values), f"{role}_median": median(values)}
     value = objective(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
     return {"objective": value * 1e3, **excess, "seconds": scores.training.seconds}
 

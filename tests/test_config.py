@@ -77,7 +77,7 @@ def test_settings_of_a_search_are_taken_with_the_choices_that_it_was_made_for(tu
 
 def test_normals_off_stay_off_under_settings_of_a_search():
     config = composed("scale=demo", "activation=hosc", "encoding=fourier", "normals=off")
-    assert config["loss"]["tau"] == 0 and config["activation"]["beta"] == 1.6
+    assert config["loss"]["tau"] == 0 and config["activation"]["beta"] == 1.2
 
 
 @pytest.mark.parametrize(("group", "choice"), [pair for pair in ALL_CHOICES if pair[0] in OTHER_TASKS])

@@ -121,11 +121,12 @@ def test_a_training_that_fails_is_an_answer_and_a_search_of_failures_says_so(sea
 
 
 def test_the_objective_weighs_roles_alike_and_counts_shapes_without_a_surface():
-    known = {"shapes": [score("a", 1e-3), score("b", 3e-3), score("c", 2e-3)]}
+    known = {"shapes": [score("a", 1e-3), score("b", 6e-3), score("c", 2e-3)]}
     held_out = {"shapes": [score("d", None, penalty=0.4)]}
     floor = 0.05e-3
-    assert objective({"known": known}) == pytest.approx(2e-3 - floor)
-    both = ((2e-3 - floor) * (0.4 - floor)) ** 0.5
+    of_known = ((2e-3 - floor) * (3e-3 - floor)) ** 0.5
+    assert objective({"known": known}) == pytest.approx(of_known)
+    both = (of_known * (0.4 - floor)) ** 0.5
     assert objective({"known": known, "held_out": held_out}) == pytest.approx(both)
     assert objective({}) is None and objective({"known": {"shapes": []}}) is None
 
