@@ -3,6 +3,8 @@
     python train.py -m search=fft_hosc scale=demo                  # a search, for each row
     python train.py experiment=fft_hosc scale=demo hydra.run.dir=SWEEP_DIR/defaults
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
+    python benchmarks/searches.py SWEEP_DIR --best 3 --enqueue OTHER_DIR      # they come first in another search:
+    python train.py -m search=fft_hosc scale=cpu search.trials=3 hydra.sweep.dir=OTHER_DIR
 
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. The
 objective is what a search lowers: the geometric mean of mean and median excess CD of known and of held-out
@@ -13,6 +15,7 @@ import argparse
 import csv
 import io
 import json
+import warnings
 from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
@@ -102,11 +105,42 @@ def csv_text(searches: dict[str, list[Trial]]) -> str:
     return text.getvalue()
 
 
+def enqueue(search: Path, other: Path, best: int) -> list[dict[str, float | int]]:
+    """Puts the settings of a search's best trials first into another search, at another scale, say.
+
+    What the other study has finished or still waits with is not asked again: after an interruption the
+    same command brings back the trial that was lost.
+
+    Returns:
+        The settings that were put there.
+    """
+    import optuna  # an extra, and slow to import
+
+    study = optuna.load_study(study_name="search", storage=f"sqlite:///{search / 'study.db'}")
+    done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
+    other.mkdir(parents=True, exist_ok=True)
+    storage = f"sqlite:///{other / 'study.db'}"
+    target = optuna.create_study(study_name="search", storage=storage, load_if_exists=True)
+    known = [
+        trial.params or trial.system_attrs.get("fixed_params")
+        for trial in target.trials
+        if trial.state.is_finished() or trial.state is optuna.trial.TrialState.WAITING
+    ]
+    ranked = sorted(done, key=lambda trial: trial.value)[:best]
+    asked = [trial.params for trial in ranked if trial.params not in known]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        for settings in asked:
+            target.enqueue_trial(settings)
+    return asked
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("searches", nargs="+", type=Path, help="folders of searches")
     parser.add_argument("--best", type=int, default=3)
     parser.add_argument("--csv", type=Path, help="all trials")
+    parser.add_argument("--enqueue", type=Path, help="folder of another search, which tries the best first")
     arguments = parser.parse_args()
     try:
         searches = {folder.name: read_search(folder) for folder in arguments.searches}
@@ -116,6 +150,10 @@ def main() -> None:
         failed = sum(trial.scores["objective"] is None for trial in trials)
         print(f"\n### {name}: {sum(trial.name != 'defaults' for trial in trials)} trials, {failed} failed\n")
         print(markdown(trials, arguments.best))
+    if arguments.enqueue:
+        for folder in arguments.searches:
+            count = len(enqueue(folder, arguments.enqueue, arguments.best))
+            print(f"\n{arguments.enqueue}: {count} settings of {folder.name} come first")
     if arguments.csv:
         write_whole(arguments.csv, csv_text(searches))
 

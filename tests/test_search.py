@@ -145,3 +145,20 @@ def test_a_search_without_optuna_or_multirun_says_what_is_missing(monkeypatch, c
     with pytest.raises(SystemExit):
         train_task.main()
     assert "search=siren: is a table of runs; add -m" in capsys.readouterr().err
+
+
+def test_the_best_trials_of_one_search_come_first_in_another(search, tmp_path):
+    from benchmarks.searches import enqueue
+
+    assert search.start("search.trials=4") == 0
+    other, sweep = tmp_path / "other", f"hydra.sweep.dir={tmp_path / 'other'}"
+    best = sorted(search.rates, key=lambda rate: abs(rate - 1e-3))[:2]
+    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folder, other, 2)] == best
+    assert enqueue(search.folder, other, 2) == [], "they wait already"
+    search.rates, search.kill_after = [], 1
+    assert search.start("scale=cpu", "search.trials=2", sweep) == 130
+    assert search.rates == best
+    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folder, other, 2)] == best[1:]
+    search.rates, search.kill_after = [], 1000
+    assert search.start("scale=cpu", "search.trials=2", sweep) == 0
+    assert search.rates == best[1:]
