@@ -3,7 +3,7 @@
     python train.py -m search=fft_hosc scale=demo                  # a search, for each row
     python train.py experiment=fft_hosc scale=demo hydra.run.dir=SWEEP_DIR/defaults
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
-    python benchmarks/searches.py SWEEP_DIR --best 3 --enqueue OTHER_DIR      # they come first in another search:
+    python benchmarks/searches.py SWEEP_DIR --best 3 --enqueue OTHER_DIR   # tried first by another search:
     python train.py -m search=fft_hosc scale=cpu search.trials=3 hydra.sweep.dir=OTHER_DIR
 
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. The

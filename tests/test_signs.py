@@ -4,7 +4,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from manifold3d import Manifold, OpType
 
-from sdfhub.data.normalize import face_normals, normalize_mesh
+from sdfhub.data.normalize import normalize_mesh
 from sdfhub.data.pieces import ROOM, cut_long
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.sampling import sample_points
@@ -16,6 +16,7 @@ from sdfhub.data.visibility import (
     view_directions,
     visible_surface,
 )
+from sdfhub.triangles import face_normals
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
 CHAIR = triangles(refined(Manifold.batch_boolean(chair_parts(), OpType.Add)))

@@ -1,8 +1,9 @@
 """Items streamed through worker processes; light imports, since a worker repeats them."""
 
 import os
+import sys
 
-from sdfhub.data.workers import stream_in_processes
+from sdfhub.data.workers import THREADS, _startable, stream_in_processes
 
 
 class DiesElsewhere:
@@ -24,3 +25,18 @@ def test_a_stream_takes_items_one_by_one_keeps_their_order_and_survives_its_work
     assert next(stream) == 0
     assert len(taken) <= 3
     assert list(stream) == [number**2 for number in range(1, 10)]
+
+
+def test_what_other_threads_do_while_workers_start_stays(monkeypatch):
+    monkeypatch.setenv(THREADS[0], "7")
+    monkeypatch.delenv(THREADS[1], raising=False)
+    monkeypatch.delenv("SDFHUB_SET_MEANWHILE", raising=False)
+    main = sys.modules["__main__"]
+    with _startable(len):
+        assert os.environ[THREADS[0]] == os.environ[THREADS[1]] == "1"
+        assert sys.modules["__main__"] is not main
+        monkeypatch.setenv("SDFHUB_SET_MEANWHILE", "yes")
+        monkeypatch.setitem(sys.modules, "imported_meanwhile", main)
+    assert os.environ[THREADS[0]] == "7" and THREADS[1] not in os.environ
+    assert os.environ["SDFHUB_SET_MEANWHILE"] == "yes" and "imported_meanwhile" in sys.modules
+    assert sys.modules["__main__"] is main

@@ -1,12 +1,11 @@
 """Raw triangle arrays, validated, moved to the normalised frame and cleaned there."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sdfhub.data.preparation import DEFAULT, Preparation
 from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import RADIUS, NormalizedMesh
+from sdfhub.triangles import face_normals, piece_count
 
 ZERO_AREA = 1e-15
 """Area, in normalised units squared, that rounding alone may leave of a line; such a triangle has none."""
@@ -35,7 +34,7 @@ def normalize_mesh(
     vertices, faces = _merged(vertices, faces)
     faces = _with_area(vertices, faces, preparation.max_zero_area)
     faces = _without_repeats(faces, len(vertices))
-    count = len(np.unique(face_components(faces, len(vertices))))
+    count = piece_count(faces, len(vertices))
     if count > preparation.max_components:
         limit = preparation.max_components
         raise RejectedMesh("too_many_components", f"{count} pieces, at most {limit} wanted")
@@ -116,16 +115,3 @@ def _with_area(vertices: np.ndarray, faces: np.ndarray, max_zero_area: float) ->
     if empty > max_zero_area:
         raise RejectedMesh("zero_area_faces", f"{empty:.1%} of the faces, at most {max_zero_area:.0%} wanted")
     return faces[filled]
-
-
-def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F, 3] normals, each as long as twice its triangle's area; counter-clockwise is outside."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
-def face_components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """[F] label of each face's connected piece: faces that share a vertex share a label."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
-    return connected_components(graph, directed=False)[1][faces[:, 0]]

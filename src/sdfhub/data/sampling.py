@@ -4,12 +4,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sdfhub.data.normalize import face_normals, normalize_mesh
+from sdfhub.data.normalize import normalize_mesh
 from sdfhub.data.preparation import DEFAULT, Preparation
 from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points
 from sdfhub.data.visibility import Surface, closed_surface, points_on_faces, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.triangles import face_normals
 
 if TYPE_CHECKING:
     import trimesh

@@ -4,9 +4,9 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.data.normalize import face_normals
 from sdfhub.data.visibility import points_on_faces
 from sdfhub.shapes import NormalizedMesh
+from sdfhub.triangles import face_normals
 
 HALF_VIEW = np.tan(np.radians(24))
 """Half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away."""

@@ -11,9 +11,9 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sdfhub.data.normalize import face_normals
 from sdfhub.data.pieces import cut_long
 from sdfhub.data.visibility import Surface, points_on_faces
+from sdfhub.triangles import face_normals
 
 VOTES = 11
 """Neighbours that vote (DeepSDF's code)."""

@@ -12,10 +12,10 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.data.normalize import face_components, face_normals
 from sdfhub.data.preparation import Preparation
 from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import NormalizedMesh
+from sdfhub.triangles import face_normals, piece_count
 
 os.environ.setdefault(
     "IGL_NUM_THREADS", "1"
@@ -223,6 +223,6 @@ def closed_surface(mesh: NormalizedMesh) -> Surface | None:
     volume = (
         np.einsum("nj,nj->", mesh.vertices[mesh.faces[:, 0]], face_normals(mesh.vertices, mesh.faces)) / 6
     )
-    if volume <= 0 or np.ptp(face_components(mesh.faces, len(mesh.vertices))) > 0:
+    if volume <= 0 or piece_count(mesh.faces, len(mesh.vertices)) > 1:
         return None
     return Surface(mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), bool), {"fast_path": 1.0})

@@ -7,13 +7,12 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, MutableMapping
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection
 from types import ModuleType
-from unittest.mock import patch
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
 """What tells the numeric libraries how many threads to start; read when they are imported."""
@@ -143,6 +142,20 @@ def _startable(function: Callable) -> Iterator[None]:
     """
     needs_main = b"__main__" in pickle.dumps(function)
     main = sys.modules["__main__"] if needs_main else ModuleType("__main__")
-    environment = patch.dict(os.environ, dict.fromkeys(THREADS, "1"))
-    with environment, patch.dict(sys.modules, {"__main__": main}):
+    with _lent(os.environ, dict.fromkeys(THREADS, "1")), _lent(sys.modules, {"__main__": main}):
         yield
+
+
+@contextmanager
+def _lent(mapping: MutableMapping, entries: dict) -> Iterator[None]:
+    """Entries for a while. Others stay as they are: threads may import modules or set variables meanwhile."""
+    before = {key: mapping[key] for key in entries if key in mapping}
+    mapping.update(entries)
+    try:
+        yield
+    finally:
+        for key in entries:
+            if key in before:
+                mapping[key] = before[key]
+            else:
+                mapping.pop(key, None)

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from sdfhub.whole_file import whole_file
+
 _INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
 
 GAP = 4
@@ -76,14 +78,6 @@ def _shortened(text: str, font, width: float) -> str:
 
 def write_picture(picture: Image.Image, path: Path, **settings) -> Path:
     """Writes a picture in the format of the path's suffix, whole or not at all; returns the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(part, "wb") as file:
-            picture.save(file, format=path.suffix[1:], **settings)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        picture.save(file, format=path.suffix[1:], **settings)
     return path

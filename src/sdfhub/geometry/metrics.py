@@ -11,12 +11,11 @@ from dataclasses import dataclass, fields
 
 import igl
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sdfhub.geometry.winding import closed_winding_numbers
 from sdfhub.shapes import NormalizedMesh
+from sdfhub.triangles import face_normals, piece_count
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -98,9 +97,9 @@ def judge(
         "cd_penalty": chamfer(np.zeros((1, 3)), want[0]),
         "vertices": len(vertices),
         "faces": len(faces),
-        "pieces": pieces(len(vertices), faces),
+        "pieces": piece_count(faces, len(vertices)),
     }
-    if not _area(vertices, faces).sum() > 0:
+    if not np.abs(face_normals(vertices, faces)).sum() > 0:
         absent = {f.name: None for f in fields(ShapeMetrics) if f.name not in known}
         return ShapeMetrics(**known, **absent | {"failed": True})
     have = sample_surface(vertices, faces, points, (seed, 2))
@@ -151,7 +150,8 @@ def sample_surface(
         ValueError: the mesh has no area.
     """
     rng = np.random.default_rng(seed)
-    cumulative = np.cumsum(_area(vertices, faces))
+    normals = face_normals(vertices, faces)
+    cumulative = np.cumsum(np.linalg.norm(normals, axis=1))
     if not (len(cumulative) and cumulative[-1] > 0):
         raise ValueError("faces: the mesh has no area to sample")
     total = cumulative[-1]
@@ -161,7 +161,7 @@ def sample_surface(
     u, v = rng.random((2, count, 1))
     fold = u + v > 1  # the far half of the parallelogram, turned back onto the triangle
     u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
-    normals = np.cross(b - a, c - a)
+    normals = normals[chosen]
     return a + u * (b - a) + v * (c - a), normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -200,14 +200,6 @@ def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> 
     inside = [closed_winding_numbers(*mesh, points) > 0 for mesh in (a, b)]
     union = np.count_nonzero(inside[0] | inside[1])
     return float(np.count_nonzero(inside[0] & inside[1]) / union) if union else None
-
-
-def pieces(vertex_count: int, faces: np.ndarray) -> int:
-    """Connected pieces of a mesh: faces that share a vertex belong together."""
-    used = np.unique(faces)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
-    return connected_components(graph, directed=False)[0] - (vertex_count - len(used))
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
@@ -314,8 +306,3 @@ def _by_cell(points: np.ndarray, cells: int = 64) -> np.ndarray:
     cell = (columns - low[:, None]) * ((cells - 1) / max((high - low).max(), 1e-300))
     x, y, z = cell.astype(np.int64)
     return np.argsort((x * cells + y) * cells + z, kind="stable")
-
-
-def _area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
