@@ -6,6 +6,7 @@ from manifold3d import CrossSection, Manifold, OpType
 from sdfhub.data.preparation import Preparation
 from sdfhub.data.procedural import CATEGORIES, generate
 from sdfhub.data.sampling import prepare_mesh
+from sdfhub.data.signs import SIGN_METHODS, Signs
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import RADIUS
 from tests.broken_twins import BREAKAGES, chair_parts, errors, refined, ring, signed_distance, triangles
@@ -62,6 +63,16 @@ def test_fast_path_is_taken_on_clean_meshes_only():
         np.concatenate([sphere[1], sphere[1] + len(sphere[0])]),
     )
     assert prepare_mesh(two, FEW).statistics["fast_path"] == 0
+
+
+def test_what_pseudo_normals_get_wrong_is_left_to_the_winding_number(monkeypatch):
+    everywhere = lambda points, *_: Signs(np.ones(len(points), bool), np.ones(len(points), bool))  # noqa: E731
+    monkeypatch.setitem(SIGN_METHODS, "pseudo_normal", everywhere)
+    shape = prepare_mesh(
+        triangles(Manifold.cube((1, 1, 1), center=True)), Preparation(samples=5000, min_faces=12)
+    )
+    assert shape.statistics["fast_path"] == 0
+    assert np.array_equal(shape.sdf < 0, np.abs(shape.points).max(axis=1) < RADIUS / 3**0.5)
 
 
 def test_samples_lie_where_the_settings_put_them():

@@ -52,6 +52,7 @@ def prepare_mesh(
         surface = visible_surface(normalized, preparation, rng)
         signed = _signed_samples(surface, preparation.sign, preparation, rng)
     points, sdf, statistics = signed
+    _check_signs(statistics, preparation)
     surface_points, surface_normals = _oriented_points(surface, preparation.surface_points, rng)
     return ShapeSamples(
         points=points.astype(np.float32),
@@ -79,13 +80,12 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
 
 
 def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: np.random.Generator):
-    """Shuffled points [N, 3], their signed distances [N], and what was found, within its limits."""
+    """Shuffled points [N, 3], their signed distances [N], and what was found."""
     points = sample_points(surface, preparation, rng)
     nearest = nearest_points(points, surface)
     signs = SIGN_METHODS[sign](points, nearest, surface, rng)
     statistics = {"fast_path": 0.0, **surface.statistics, "certain": float(signs.certain.mean())}
     statistics |= {"inside": float(signs.inside.mean()), "faces": float(len(surface.faces))}
-    _check_signs(statistics, preparation)
     sdf = np.where(signs.inside, -nearest.distance, nearest.distance)
     order = rng.permutation(len(points))
     if preparation.drop_uncertain:

@@ -158,7 +158,8 @@ def prepare_part(
         shapes: this part's own; the other arguments are those of `prepare`.
 
     Returns:
-        How many were prepared; the others were there.
+        How many were prepared or rejected; the others were there, or are left to the next call, since
+        their worker died.
 
     Raises:
         SdfhubError: the store cannot be written.
@@ -169,7 +170,8 @@ def prepare_part(
             _refuse_detours(shapes, folder)
             manifest = read_manifest(folder) or new_manifest(source.name, preparation)
             left = _left_after_folders(shapes, manifest, folder)
-            return sum(1 for _ in _results(source, left, preparation, folder, workers, progress))
+            results = _results(source, left, preparation, folder, workers, progress)
+            return sum(not isinstance(record, Crashed) for _, record in results)
     except OSError as error:
         raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
 
