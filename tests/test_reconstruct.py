@@ -12,6 +12,7 @@ import trimesh
 
 from sdfhub.data.scan import Scan
 from sdfhub.data.target import observed
+from sdfhub.errors import SdfhubError
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks import calibration as calibrations
 from sdfhub.tasks import reconstruct as task
@@ -165,6 +166,19 @@ def test_of_each_shape_several_views_are_calibrated_and_one_of_any_other_scan():
     assert len(views) == 2 * calibrations.VIEWS == 4
     assert len({each.observation.points.tobytes() for each in views}) == 4
     assert len(Alike("bare", 1024, 0.0).targets(shapes, evidence)) == 2
+
+
+def test_a_rod_is_looked_at_again_where_it_was_seen_from_its_end(monkeypatch):
+    rod = trimesh.creation.box((0.03, 0.03, 1.9))
+    mesh = NormalizedMesh(np.array(rod.vertices), np.array(rod.faces), np.zeros(3), 1.0)
+    shape = SimpleNamespace(id="rod", fingerprint="f", up="z", mesh=mesh)
+    end, side = np.array([0, 0, 2.5]), np.array([2.5, 0, 0])
+    sensors = iter([end, end, side])
+    monkeypatch.setattr(calibrations, "random_sensor", lambda *_: next(sensors))
+    assert Alike("view", 0, 0.0).scan(shape).sensor is side
+    monkeypatch.setattr(calibrations, "random_sensor", lambda *_: end)
+    with pytest.raises(SdfhubError, match="rod: is too thin to be seen"):
+        Alike("view", 0, 0.0).scan(shape)
 
 
 def test_limits_of_another_rule_are_not_taken(run, monkeypatch):

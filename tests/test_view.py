@@ -118,6 +118,18 @@ def viewer(space):
     viewer.close()
 
 
+def test_a_mesh_that_fails_is_told_and_the_next_one_comes(ball_mesher):
+    _, mesher, shown = ball_mesher
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Ball, "forward", lambda *_: torch.empty(2**62))
+        mesher.ask(torch.tensor([0.3]))
+        wait_until(lambda: shown)
+    assert isinstance(shown[0], SdfhubError) and "RuntimeError" in str(shown[0])
+    mesher.ask(torch.tensor([0.5]))
+    wait_until(lambda: len(shown) == 3)
+    assert radius(shown[-1]) == pytest.approx(0.5, abs=0.01)
+
+
 def size_shown(viewer) -> float:
     return float(np.linalg.norm(viewer.mesh.vertices, axis=1).mean())
 
