@@ -263,8 +263,11 @@ def test_rows_of_one_method_are_told_apart_and_common_settings_stand_in_the_titl
         write_cell(
             sweep, planned("FFT/HOSC", **{"activation.beta": beta, "trainer.max_epochs": "3"}), [0.1e-3]
         )
-    details = [row.detail for row in only_group(sweep).rows]
-    assert details == [f"activation.beta={beta}" for beta in ("1", "2", "1.23", "1.23e+07")]
+    group = only_group(sweep)
+    assert [row.detail for row in group.rows] == [
+        f"activation.beta={b}" for b in ("1", "2", "1.23", "1.23e+07")
+    ]
+    assert not [table.title for table in tables(group) if "paper" in table.title], "none of these is its row"
 
 
 def test_a_row_without_any_surface_is_no_ones_best_and_tests_no_claim(small):

@@ -39,7 +39,7 @@ def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, known ones beside the paper, costs, and what is missing."""
     roles = [role for role in ROLES if any(row.estimate("cd_mean", role) for row in group.rows)]
     found = [_scores(group, role) for role in roles]
-    beside = [_beside_paper(group)] if "known" in roles else []
+    beside = [_beside_paper(group)] if "known" in roles and not all(row.detail for row in group.rows) else []
     return [*found[:1], *beside, *found[1:], _costs(group), *_missing(group)]
 
 
