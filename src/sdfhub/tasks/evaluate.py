@@ -1,6 +1,7 @@
 """Task `evaluate`: a trained shape space is meshed and judged, known and held-out shapes apart."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -31,10 +32,14 @@ from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.opening import load
 from sdfhub.tasks.prepare import prepare_split
 from sdfhub.tasks.run import read_run, refuse_unwritable
-from sdfhub.tasks.scoresheet import Judged, write_distances, write_scores
+from sdfhub.tasks.scoresheet import Judged, pictured, write_distances, write_reconstruction, write_scores
 
 WORTH_A_PROCESS = 4
 """Shapes to judge for which a worker process is started: it takes as long to start as to judge one or two."""
+
+NOISE = 64
+"""Faces, in squared resolutions, above which a mesh is noise: ten times those of the unit sphere. What a
+training that diverged leaves crosses zero in every cell: it is no surface, and would take gigabytes."""
 
 BATCH = 2**16
 """Points a call when signed distances are judged; bounds memory, not the result."""
@@ -122,7 +127,7 @@ def evaluate_model(
         delta = evaluation.fit.delta
         rows = [(role, shape, distance_errors(decoder, code, shape, delta)) for role, shape, code in roles]
         return write_distances(rows, training, out)
-    return write_scores(judge_all(decoder, roles, evaluation), evaluation, training, out)
+    return write_scores(judge_all(decoder, roles, evaluation, out), evaluation, training, out)
 
 
 def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:
@@ -147,29 +152,48 @@ def _drawn(shapes: list[StoredShape], seeds: list[int], samples: int, step: int)
 
 
 def judge_all(
-    decoder: Decoder, roles: Sequence[tuple[str, StoredShape, Tensor]], evaluation: Evaluation
+    decoder: Decoder,
+    roles: Sequence[tuple[str, StoredShape, Tensor]],
+    evaluation: Evaluation,
+    out: Path,
 ) -> list[Judged]:
     """Reconstructs shapes one after another, while worker processes judge those before.
+
+    A mesh is written and drawn when it is made, and not kept: a thousand would not fit into memory.
 
     Args:
         decoder: in evaluation mode.
         roles: role, shape and code [L] of each.
         evaluation: how to judge; its `workers` change speed, not scores.
+        out: folder of the results, for the meshes.
     """
-    meshes = []
+    pictures, of_role = [], Counter()
 
     def pairs() -> Iterator[tuple[Mesh, NormalizedMesh]]:
-        for _, shape, code in tqdm(roles, desc="judging", unit="shape", leave=False, disable=None):
-            meshes.extend(reconstruct(decoder, code[None], evaluation.resolution))
-            yield meshes[-1], shape.mesh
+        for role, shape, code in tqdm(roles, desc="judging", unit="shape", leave=False, disable=None):
+            (mesh,) = reconstruct(decoder, code[None], evaluation.resolution)
+            mesh = _resolved(shape, mesh, evaluation.resolution)
+            write_reconstruction(role, shape, mesh, out)
+            of_role[role] += 1
+            pictures.append(pictured(shape, mesh) if of_role[role] <= evaluation.pictures else None)
+            yield mesh, shape.mesh
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
     metrics = stream_in_processes(Judge(evaluation.points, evaluation.seed), pairs(), workers)
     return [
-        Judged(role, shape, row, *mesh)
-        for (role, shape, _), row, mesh in zip(roles, list(metrics), meshes, strict=True)
+        Judged(role, shape, row, drawn)
+        for (role, shape, _), row, drawn in zip(roles, list(metrics), pictures, strict=True)
     ]
+
+
+def _resolved(shape: StoredShape, mesh: Mesh, resolution: int) -> Mesh:
+    """The mesh, or none where it is noise."""
+    vertices, faces = mesh
+    if len(faces) <= NOISE * resolution**2:
+        return mesh
+    print(f"{shape.id}: its field is noise, {len(faces):,} faces: counts as no surface", flush=True)
+    return vertices[:0], faces[:0]
 
 
 @torch.inference_mode()

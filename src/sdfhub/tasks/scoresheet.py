@@ -14,6 +14,7 @@ import numpy as np
 
 from sdfhub.data.shards import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import ShapeMetrics, summarize
 from sdfhub.geometry.render import render
 from sdfhub.tasks.mesh_file import write_mesh
@@ -31,19 +32,43 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """One judged shape: who it is, how good it is, and what it looks like in the normalised frame."""
+    """One judged shape: who it is, how good it is and, where it is on the sheet, what it looks like.
+
+    Args:
+        role: `known` or `held_out`.
+        shape: the truth.
+        metrics: of its reconstruction.
+        pictures: of the truth and of the reconstruction; words stand for a surface that is not there.
+    """
 
     role: str
     shape: StoredShape
     metrics: ShapeMetrics
-    vertices: np.ndarray
-    faces: np.ndarray
+    pictures: tuple[np.ndarray, np.ndarray | str] | None
+
+
+def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -> None:
+    """Writes a reconstruction below `meshes/`, in the frame of the source's own meshes.
+
+    Args:
+        role, shape: of which it is one.
+        mesh: normalised frame; nothing is written where it has no faces.
+        out: folder of the results.
+    """
+    vertices, faces = mesh
+    write_mesh(vertices / shape.scale + shape.center, faces, out / "meshes" / role / f"{shape.id}.ply")
+
+
+def pictured(shape: StoredShape, mesh: Mesh) -> tuple[np.ndarray, np.ndarray | str]:
+    """Pictures of a shape and of its reconstruction, normalised frame."""
+    truth = render(shape.mesh.vertices, shape.mesh.faces, up=shape.up)
+    return truth, render(*mesh, up=shape.up) if len(mesh[1]) else "no surface"
 
 
 def write_scores(
     judged: Sequence[Judged], evaluation: Any, training: dict[str, Any] | None, out: Path
 ) -> dict[str, Any]:
-    """Writes `metrics.json`, `metrics.csv`, `meshes/` and `contact_sheet.png` below `out`; prints the table.
+    """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
 
     Args:
         judged: what was judged, in the order of the table.
@@ -60,10 +85,7 @@ def write_scores(
         shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
         result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
     write_whole(out / "metrics.csv", _csv(judged))
-    for row in judged:
-        vertices = row.vertices / row.shape.scale + row.shape.center
-        write_mesh(vertices, row.faces, out / "meshes" / row.role / f"{row.shape.id}.ply")
-    _write_sheet(judged, evaluation.pictures, out / "contact_sheet.png")
+    _write_sheet([row for row in judged if row.pictures], out / "contact_sheet.png")
     write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print(table(judged))
     print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
@@ -116,17 +138,11 @@ def _csv(judged: Sequence[Judged]) -> str:
     return text.getvalue()
 
 
-def _write_sheet(judged: Sequence[Judged], pictures: int, path: Path) -> None:
-    """Ground truth above reconstruction, known shapes first; CD times 10^3, as in the table."""
-    shown = [
-        row for role in ("known", "held_out") for row in [r for r in judged if r.role == role][:pictures]
-    ]
-    truth = [render(row.shape.mesh.vertices, row.shape.mesh.faces, up=row.shape.up) for row in shown]
-    ours = [
-        render(row.vertices, row.faces, up=row.shape.up) if len(row.faces) else "no surface" for row in shown
-    ]
+def _write_sheet(shown: Sequence[Judged], path: Path) -> None:
+    """Ground truth above reconstruction; CD times 10^3, as in the table."""
     captions = [f"{row.shape.id}\n{_title(row)}" for row in shown]
-    contact_sheet([truth, ours], ["ground truth", "reconstruction"], captions, path)
+    pictures = list(zip(*(row.pictures for row in shown), strict=True)) or [(), ()]
+    contact_sheet(pictures, ["ground truth", "reconstruction"], captions, path)
 
 
 def _title(row: Judged) -> str:
