@@ -55,7 +55,8 @@ def read_search(folder: Path) -> list[Trial]:
     if not all("search" in cell.plan.choices for cell in cells):
         raise SdfhubError(f"{folder}: not a search; `sdfhub report` tells what a sweep found")
     said = [cell.plan.settings for cell in cells]
-    searched = [key for key in said[0] if len({settings.get(key) for settings in said}) > 1] if said else []
+    everywhere = sorted(set.intersection(*map(set, said))) if said else []
+    searched = [key for key in everywhere if len({settings[key] for settings in said}) > 1]
     found = [
         Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})
         for cell in cells
