@@ -70,14 +70,7 @@ def time_judge(count: int) -> None:
 
 
 def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "sdfhub",
-        "evaluate",
-        f"run={space}",
-        f"evaluate.resolution={resolution}",
-    ]
+    command = [sys.executable, "-m", "sdfhub", "evaluate", f"run={space}"]
     with tempfile.TemporaryDirectory() as out:
         command += [f"evaluate.resolution={resolution}", f"evaluate.known={shapes}"]
         command += ["evaluate.held_out=0", f"out={out}"]

@@ -84,6 +84,7 @@ def keys_and_groups() -> tuple[list[str], dict[str, list[str]]]:
     folder = configuration_folder()
     defaults = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))["defaults"]
     own = [group for entry in defaults if isinstance(entry, dict) for group in entry if "/" not in group]
+    own = [group.removeprefix("optional ") for group in own]
     groups = {
         group: sorted(path.stem for path in (folder / group).glob("*.yaml"))
         for group in own
@@ -111,9 +112,8 @@ def random_override(chance: random.Random, keys: list[str], groups: dict[str, li
         elif kind < 0.9:
             words.append(f"{misspelt(chance, key)}={chance.choice(VALUES)}")
         else:
-            words.append(
-                chance.choice([f"+{key}.new=1", f"~{key}", f"++{key}=1", key, f"{key}=", f"+{group}=x", "=1"])
-            )
+            odd = [f"+{key}.new=1", f"~{key}", f"++{key}=1", key, f"{key}=", "=1"]
+            words.append(chance.choice([*odd, f"+{group}=x", f"~{group}"]))
     return words
 
 

@@ -1,6 +1,7 @@
 """Runs train.py as a user would and reads what it wrote."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ def train(name: str, *overrides: str) -> dict:
         RuntimeError: the run failed; the message is its own last line.
     """
     folder = ROOT / "outputs" / "benchmarks" / name
+    shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
     command = [
         sys.executable,
         "train.py",

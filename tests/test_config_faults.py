@@ -52,7 +52,7 @@ NUMBERS = [key for key in KEYS if isinstance(flat(CONFIG)[key], float)]
 COUNTS = [
     key
     for key in KEYS
-    if type(flat(CONFIG)[key]) is int and not key.endswith(("seed", "max_epochs")) and "trainer" not in key
+    if type(flat(CONFIG)[key]) is int and not key.endswith("max_epochs") and "trainer" not in key
 ]
 
 
@@ -87,7 +87,28 @@ def test_a_count_with_a_point_is_the_same_count(key, tmp_path):
         start(with_value(key, float(flat(CONFIG)[key])), tmp_path)
 
 
-@pytest.mark.parametrize("value", ["abc", None, 1.5])
+def test_a_seed_beyond_what_generators_take_is_named(tmp_path):
+    with pytest.raises(SdfhubError, match="seed"):
+        start(with_value("seed", 2**31), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("word", "reply"),
+    [
+        ("~callbacks", "callbacks: is needed"),
+        *((f"~{group}", f"{group}: is needed") for group in ("trainer", "data", "fit", "loss", "category")),
+        *((f"~{group}", "are needed") for group in ("activation", "encoding", "decoder", "scale")),
+        ("~data.held_out", "data.held_out: is needed"),
+        ("+checkpoint.save_top_k=3", "checkpoint.save_top_k: no such setting"),
+        ("trainer.max_steps=10", "write +trainer.max_steps="),
+    ],
+)
+def test_what_is_left_out_or_unknown_is_named(word, reply, tmp_path):
+    verdict, told = answer([word], tmp_path)
+    assert verdict == "refused" and reply in told, (verdict, told)
+
+
+@pytest.mark.parametrize("value", ["abc", None, 1.5, 0])
 def test_a_limit_of_steps_that_is_none_is_named(value, tmp_path):
     config = copy.deepcopy(CONFIG)
     config["trainer"]["max_steps"] = value

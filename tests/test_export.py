@@ -124,6 +124,9 @@ def test_interpolation_is_a_strip_an_animation_there_and_back_a_scene_and_meshes
     assert len(radii) == 4 and np.allclose([radii[0], radii[3]], [RADII[0], RADII[3]], atol=0.03)
     scene = trimesh.load_scene(tmp_path / "meshes.glb")
     assert len(scene.geometry) == 4 and scene.extents[0] > 6
+    words[3] = "steps=2"
+    told(monkeypatch, capsys, interpolate, *words)
+    assert len(list(tmp_path.glob("meshes/*"))) == 2, "those of the longer way are gone"
 
 
 def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch, capsys):

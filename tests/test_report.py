@@ -238,6 +238,13 @@ def test_the_papers_own_numbers_bear_out_its_claims_but_two(name, tmp_path):
     assert normals.state == "not tested" and "no such row: SIREN, normals off" in normals.figures
 
 
+def test_a_claim_about_a_row_that_is_there_twice_says_so(tmp_path):
+    for rate in ("1e-3", "1e-2"):
+        write_cell(tmp_path, planned("SIREN", **{"optim.lr_codes": rate}), [0.1e-3])
+    figures = {figure for one in verdicts(only_group(tmp_path)) for figure in one.figures}
+    assert any(figure.startswith("several rows: SIREN") for figure in figures)
+
+
 def test_a_claim_that_needs_all_fails_with_one_figure_and_is_untested_without_it(small):
     found = {one.claim.text: one for one in verdicts(only_group(small))}
     surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]

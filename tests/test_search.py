@@ -32,7 +32,7 @@ def space(search: str) -> dict[str, str]:
 @pytest.mark.parametrize("search", SEARCHES)
 def test_every_setting_that_is_searched_is_one_of_its_row(search):
     params = space(search)
-    assert params.pop("experiment") == search
+    assert params.pop("experiment") == search and params.pop("search.of") == "${search_digest:}"
     config = composed(f"experiment={search}")
     for key in params:
         node = config
@@ -84,10 +84,7 @@ def search(monkeypatch, tmp_path):
             return stop.code
         return 0
 
-    stand_in.start, stand_in.folder = (
-        start,
-        tmp_path / "outputs/sweeps/search_fft_hosc_procedural_chairs_demo",
-    )
+    stand_in.start, stand_in.folders = start, lambda: sorted((tmp_path / "outputs/sweeps").iterdir())
     return stand_in
 
 
@@ -100,24 +97,39 @@ def test_an_interrupted_search_goes_on_to_its_budget_and_not_beyond(search):
     assert len(search.rates) == 5, "two more trials: the interrupted one has no value"
     assert search.start("search.trials=4") == 0
     assert len(search.rates) == 5, "the budget is spent"
-    found = yaml.safe_load((search.folder / "optimization_results.yaml").read_text())
+    found = yaml.safe_load((search.folders()[0] / "optimization_results.yaml").read_text())
     finished = [rate for index, rate in enumerate(search.rates) if index != 2]
     assert found["best_params"]["optim.lr_decoder"] == min(finished, key=lambda rate: abs(rate - 1e-3))
-    cells = read_sweep(search.folder)
+    cells = read_sweep(search.folders()[0])
     assert [cell.state for cell in cells].count("done") == 4
     assert {cell.plan.choices["experiment"] for cell in cells} == {"fft_hosc"}
-    assert (search.folder / "report" / "report.html").is_file()
+    assert (search.folders()[0] / "report" / "report.html").is_file()
 
 
 def test_a_training_that_fails_is_an_answer_and_a_search_of_failures_says_so(search, capsys):
     search.fail_after = 1
     assert search.start("search.trials=2") == 1, "as any sweep with a failed cell"
-    assert [cell.state for cell in read_sweep(search.folder)] == ["done", "failed"]
-    assert (search.folder / "optimization_results.yaml").is_file()
+    assert [cell.state for cell in read_sweep(search.folders()[0])] == ["done", "failed"]
+    assert (search.folders()[0] / "optimization_results.yaml").is_file()
     search.fail_after, search.rates = 0, []
     assert search.start("search.trials=2", "category=lamps") == 2
     told = capsys.readouterr().err
     assert "not one training came to its end" in told and "Traceback" not in told
+
+
+def test_searches_under_other_settings_are_other_searches(search):
+    assert search.start("search.trials=2") == 0
+    assert search.start("search.trials=2", "seed=1") == 0
+    assert len(search.rates) == 4, "each has its own budget"
+    both = search.folders()
+    assert len(both) == 2
+    assert all(folder.name.startswith("search_fft_hosc_procedural_chairs_demo_of-") for folder in both)
+    assert [{cell.plan.seed for cell in read_sweep(folder)} for folder in both] in ([{0}, {1}], [{1}, {0}])
+
+
+def test_the_objective_of_shapes_without_meshes_is_the_error_of_distances():
+    shapes = [{"id": "a", "sdf_error": 0.01, "sign_accuracy": 1.0}, {"id": "b", "sdf_error": 0.03}]
+    assert objective({"known": {"shapes": shapes}}) == pytest.approx(0.02)
 
 
 def test_the_objective_weighs_roles_alike_and_counts_shapes_without_a_surface():
@@ -153,12 +165,12 @@ def test_the_best_trials_of_one_search_come_first_in_another(search, tmp_path):
     assert search.start("search.trials=4") == 0
     other, sweep = tmp_path / "other", f"hydra.sweep.dir={tmp_path / 'other'}"
     best = sorted(search.rates, key=lambda rate: abs(rate - 1e-3))[:2]
-    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folder, other, 2)] == best
-    assert enqueue(search.folder, other, 2) == [], "they wait already"
+    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folders()[0], other, 2)] == best
+    assert enqueue(search.folders()[0], other, 2) == [], "they wait already"
     search.rates, search.kill_after = [], 1
     assert search.start("scale=cpu", "search.trials=2", sweep) == 130
     assert search.rates == best
-    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folder, other, 2)] == best[1:]
+    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folders()[0], other, 2)] == best[1:]
     search.rates, search.kill_after = [], 1000
     assert search.start("scale=cpu", "search.trials=2", sweep) == 0
     assert search.rates == best[1:]

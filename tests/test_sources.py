@@ -63,18 +63,23 @@ def test_procedural_refuses_what_it_cannot_make():
 @pytest.mark.parametrize("layout", ["model.obj", "models/model_normalized.obj"])
 def test_shapenet_of_both_versions_with_deepsdf_splits(tmp_path, layout):
     synset = CATEGORIES["chairs"]["synset"]
-    for model in ("aa", "bb", "cc"):
+    for model in ("aa", "bb", "c (1)"):
         put(tmp_path / "tree" / synset / model / layout)
     (tmp_path / "tree" / synset / "empty").mkdir()
     splits = {}
-    for role, models in (("train", ["aa", "gone"]), ("test", ["cc"])):
+    for role, models in (("train", ["aa", "gone"]), ("test", ["c (1)"])):
         listed = json.dumps({"ShapeNetV2": {synset: models}}).encode()
         splits[f"{role}_split"] = str(put(tmp_path / role, listed))
     categories = {"chairs": CATEGORIES["chairs"]}
-    assert ids(ShapeNetSource(categories, str(tmp_path / "tree"))) == ["chairs/aa", "chairs/bb", "chairs/cc"]
+    assert ids(ShapeNetSource(categories, str(tmp_path / "tree"))) == [
+        "chairs/aa",
+        "chairs/bb",
+        "chairs/c_1_",
+    ]
     source = ShapeNetSource(categories, str(tmp_path / "tree"), **splits)
-    assert [(s.id, s.split) for s in source.shapes()] == [("chairs/aa", "train"), ("chairs/cc", "test")]
-    assert len(pickle.loads(pickle.dumps(source)).load(source.shapes()[0])[1]) == len(BALL.faces)
+    assert [(s.id, s.split) for s in source.shapes()] == [("chairs/aa", "train"), ("chairs/c_1_", "test")]
+    for shape in source.shapes():
+        assert len(pickle.loads(pickle.dumps(source)).load(shape)[1]) == len(BALL.faces)
 
 
 def test_shapenet_names_what_is_missing(tmp_path):
@@ -119,6 +124,15 @@ def test_folder_honours_one_split_file_for_both_sides(tmp_path):
     split = str(put(tmp_path / "split.json", json.dumps({"train": ["a", "sub/b"], "test": ["c"]}).encode()))
     shapes = FolderSource(str(tmp_path / "m"), split, split).shapes()
     assert [(s.id, s.split) for s in shapes] == [("folder/a", "train"), ("sub/b", "train"), ("sub/c", "test")]
+
+
+def test_a_name_that_is_a_path_means_that_file_alone(tmp_path):
+    for name in ("a", "sub/a", "sub/b"):
+        put(tmp_path / "m" / f"{name}.obj")
+    split = str(put(tmp_path / "split.json", json.dumps({"train": ["sub/a"], "test": ["a", "b"]}).encode()))
+    shapes = FolderSource(str(tmp_path / "m"), split, split).shapes()
+    roles = {shape.id: shape.split for shape in shapes}
+    assert roles == {"folder/a": "test", "sub/a": "train", "sub/b": "test"}
 
 
 @pytest.mark.parametrize(

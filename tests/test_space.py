@@ -195,6 +195,8 @@ def test_principal_directions_are_orthogonal_and_as_long_as_codes_spread_along_t
         (lambda space: space.sdf(on_axis(1), []), "no shape is named"),
         (lambda space: space.sdf(on_axis(1), True), "no row True"),
         (lambda space: space.mesh(IDS[:2], resolution=8), "expected one shape, got several"),
+        (lambda space: next(space.meshes(IDS[0])), "takes several shapes"),
+        (lambda space: next(space.meshes(space.codes[0])), "takes several shapes"),
         (lambda space: space.interpolate(IDS[:2], 1, 3), "expected one shape, got several"),
         (lambda space: space.fit(on_axis(1), frame="unknown"), "frame='unknown': must be 'shape'"),
         (lambda space: space.interpolate(0, 1, 2.5), "steps=2.5: must be a whole number"),

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
+from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Hosc, Relu, Siren, joined
 from sdfhub.model.computing import Computing
 from sdfhub.model.dropout import kept
@@ -292,6 +293,14 @@ def test_resident_samples_give_the_batches_of_the_store(copies):
             if name == "sdf":  # far distances are cut, far outside of what the loss clamps
                 have, want = have.clamp(-0.9, 0.9), want.clamp(-0.9, 0.9)
             torch.testing.assert_close(have, want, rtol=0, atol=2e-5)
+
+
+def test_resident_samples_refuse_what_the_store_refuses():
+    shape = FakeShape(0.4)
+    shape.rows = lambda name: 0 if name == "surface" else 100
+    shape.id = "chairs/a"
+    with pytest.raises(SdfhubError, match="chairs/a: holds no surface samples"):
+        ResidentBatches([shape], Loading(1, 8, 4, 1, 0, Augmentation(), seed=5), torch.device("cpu"))
 
 
 @pytest.mark.parametrize("choice", CHOICES)

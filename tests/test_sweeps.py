@@ -131,6 +131,17 @@ def test_a_finished_cell_is_known_by_its_settings_alone():
     assert "loss.delta" in flat(config)
 
 
+@pytest.mark.parametrize("key", ["data.source.root", "computing.matmul"])
+def test_cells_of_other_data_or_products_are_other_cells(key):
+    one, other = ({"data": {"source": {}}, "computing": {}} for _ in range(2))
+    *path, last = key.split(".")
+    for value, node in (("chairs", one), ("tables", other)):
+        for part in path:
+            node = node[part]
+        node[last] = value
+    assert settings_digest(one) != settings_digest(other)
+
+
 class Trainer:
     """Stands in for training: notes its calls, writes scores, fails or is interrupted where told to."""
 

@@ -176,7 +176,10 @@ class Space:
 
     def meshes(self, shapes: Sequence[Shape] | Tensor, resolution: int = 256) -> Iterator[Mesh]:
         """The surfaces of several shapes, worked out together, each as `mesh` gives it."""
-        found = reconstruct(self.decoder, self.code(shapes), resolution)
+        codes = self.code(shapes)
+        if codes.dim() != 2:
+            raise SdfhubError("meshes: takes several shapes, a list or codes [S, L]; mesh takes one")
+        found = reconstruct(self.decoder, codes, resolution)
         for shape, (vertices, faces) in zip(shapes, found, strict=True):
             yield self.frame(shape).to_source(vertices), faces
 

@@ -74,7 +74,7 @@ class Loading:
 
     def __post_init__(self):
         least = {"shapes_per_step": 1, "samples_per_shape": 2, "surface_per_shape": 0}
-        least |= {"passes_per_epoch": 1, "workers": 0}
+        least |= {"passes_per_epoch": 1, "workers": 0, "seed": 0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
@@ -150,9 +150,18 @@ def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> 
     return np.concatenate([random_rows(shape, name, wanted, rng) for name, wanted in sides])
 
 
-def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
+def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
+    """Refuses to draw rows of an array that has none.
+
+    Raises:
+        SdfhubError: names the shape and the array.
+    """
     if count and not shape.rows(name):
         raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
+
+
+def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
+    refuse_empty(shape, name, count)
     start = int(rng.integers(shape.rows(name))) if count else 0
     return shape.read(name, start, count)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from sdfhub.data.batches import Loading, StepBatches, batch_of
+from sdfhub.data.batches import Loading, StepBatches, batch_of, refuse_empty
 from sdfhub.data.shards import COLUMNS
 from sdfhub.data.store import StoredShape
 from sdfhub.shapes import Batch
@@ -29,6 +29,11 @@ class ResidentBatches(StepBatches):
     def __init__(self, shapes: Sequence[StoredShape], loading: Loading, device: torch.device):
         super().__init__(shapes, loading)
         self.device = device
+        self.wanted = {"outside": loading.samples_per_shape - loading.samples_per_shape // 2}
+        self.wanted |= {"inside": loading.samples_per_shape // 2, "surface": loading.surface_per_shape}
+        for shape in shapes:
+            for name, count in self.wanted.items():
+                refuse_empty(shape, name, count)
         self.counts = {name: [shape.rows(name) for shape in shapes] for name in EXTENT}
         self.first = {name: np.cumsum([0, *counts]) for name, counts in self.counts.items()}
         self.tables = {name: self._table(name) for name in EXTENT}
@@ -45,17 +50,14 @@ class ResidentBatches(StepBatches):
 
     def __getitem__(self, step: int) -> Batch:
         rows = self.rows_of(step)
-        inside = self.loading.samples_per_shape // 2
-        wanted = {"outside": self.loading.samples_per_shape - inside, "inside": inside}
-        wanted["surface"] = self.loading.surface_per_shape
         starts = np.zeros((3, len(rows)), np.int64)
         for column, row in enumerate(rows):
             rng, index = self.generator(step, row), row % len(self.shapes)
             for line, name in enumerate(EXTENT):
-                starts[line, column] = rng.integers(self.counts[name][index]) if wanted[name] else 0
+                starts[line, column] = rng.integers(self.counts[name][index]) if self.wanted[name] else 0
         shapes = torch.from_numpy(rows % len(self.shapes))
         drawn = [
-            self._gathered(name, shapes, torch.from_numpy(start), wanted[name])
+            self._gathered(name, shapes, torch.from_numpy(start), self.wanted[name])
             for name, start in zip(EXTENT, starts, strict=True)
         ]
         samples, surface = torch.cat(drawn[:2], dim=1), drawn[2]

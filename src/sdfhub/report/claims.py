@@ -61,8 +61,9 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
         row = group.row(*name)
         value = row.estimate(below.quantity, below.role) if row else None
         if value is None:
+            of_method = group.rows_of(*name)
             shown = row.label if row else f"{name[0]}, normals {name[1]}"
-            return None, False, f"no such row: {shown}"
+            return None, False, f"{'several rows' if len(of_method) > 1 else 'no such row'}: {shown}"
         if below.quantity in THOUSANDFOLD and not row.has_surfaces(below.role):
             return None, False, f"no shape has a surface: {row.label}"
         sides.append((row.label, value))

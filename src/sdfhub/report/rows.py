@@ -135,9 +135,13 @@ class Group:
         return ", ".join([self.choices.get("category", "all"), *named, *counted])
 
     def row(self, method: str, normals: str) -> Row | None:
-        """The row of that method without further detail, if it is there."""
-        of_method = [row for row in self.rows if (row.method, row.normals) == (method, normals)]
+        """The row of that method, where there is one and no other."""
+        of_method = self.rows_of(method, normals)
         return of_method[0] if len(of_method) == 1 else None
+
+    def rows_of(self, method: str, normals: str) -> list[Row]:
+        """The rows of that method; several where they differ in a setting."""
+        return [row for row in self.rows if (row.method, row.normals) == (method, normals)]
 
     @property
     def deepsdf(self) -> Row | None:

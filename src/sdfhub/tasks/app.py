@@ -1,5 +1,6 @@
 """The shell around every task: Hydra composes, the task runs, a user's mistake becomes one line."""
 
+import inspect
 import os
 import re
 import sys
@@ -10,13 +11,14 @@ from difflib import get_close_matches
 from pathlib import Path
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import sdfhub
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.names import cell_name, run_name, run_stamp, sweep_name
+from sdfhub.tasks.names import cell_name, run_name, run_stamp, search_digest, sweep_name
 from sdfhub.tasks.search import trials_left
 
 
@@ -31,7 +33,7 @@ def register_resolvers() -> None:
     """Makes the functions that configs call known to them, here or in a launcher's worker."""
     # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
     warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
-    for name in (run_name, run_stamp, sweep_name, cell_name, trials_left):
+    for name in (run_name, run_stamp, search_digest, sweep_name, cell_name, trials_left):
         OmegaConf.register_new_resolver(name.__name__, name, replace=True)
     OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
     # two runs that start in one second must not share a folder
@@ -140,7 +142,7 @@ def told_by_plugin(error: Exception) -> SdfhubError | None:
 
 
 def refuse_strangers(config: DictConfig, config_name: str) -> None:
-    """Refuses top-level keys that nothing reads, such as `+sweep=...` written for `sweeps=...`.
+    """Refuses top-level keys that nothing reads, such as `+sweep=...`, and to go without those that are read.
 
     Raises:
         SdfhubError: names the key.
@@ -149,6 +151,12 @@ def refuse_strangers(config: DictConfig, config_name: str) -> None:
     for key in config:
         if key not in {*_groups(), *read[0], *read[1]}:
             raise SdfhubError(_no_such_key(str(key), config_name))
+    node = {key: value for key, value in read[1].items() if key not in ("defaults", "hydra")}
+    there = {*_leaves(OmegaConf.to_container(config, resolve=False)), *HydraConfig.get().runtime.choices}
+    groups = [group for group, choice in _composed_groups(config_name).items() if choice and " " not in group]
+    for key in (*groups, *_leaves(node)):
+        if key not in there:
+            raise SdfhubError(f"{key}: is needed; do not leave it out")
 
 
 def one_line(error: Exception, config_name: str = "config") -> str:
@@ -162,9 +170,11 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     if "hydra/launcher/ray'" in text:
         return "hydra/launcher=ray: is not installed here; pip install hydra-ray-launcher"
     if text.startswith("Config group override must be"):
-        return "a group takes the name of one of its choices; ~GROUP leaves it out"
+        return "a group takes the name of one of its choices"
     if text.startswith("Ambiguous value"):
         return f"{text} To train one after another, add -m."
+    if text.startswith("Error resolving interpolation '${scale}_"):
+        return "scale, decoder, activation and encoding: are needed; do not leave one out"
     unknown = re.match(r"Could not override '([^']+)'", text)
     missing = re.match(r"Missing mandatory value: (\S+)", text)
     if missing:
@@ -175,6 +185,8 @@ def one_line(error: Exception, config_name: str = "config") -> str:
 def _no_such_key(key: str, config_name: str = "config") -> str:
     group, _, below = key.partition(".")
     groups = _groups()
+    if group == "trainer" and below in inspect.signature(lightning_trainer()).parameters:
+        return f"{key}: conf/ does not set it; write +{key}=..."
     if below and group in groups:
         keys = _keys_of(group)
         near = get_close_matches(key, keys, n=1, cutoff=0.85)
@@ -185,6 +197,13 @@ def _no_such_key(key: str, config_name: str = "config") -> str:
     choices = f"the keys are {', '.join(own)}" if own else f"the groups are {', '.join(groups)}"
     hint = f"did you mean {near[0]!r}?" if near else choices
     return f"there is no group or key {key!r}; {hint}"
+
+
+def lightning_trainer() -> type:
+    """Lightning's Trainer, which takes seconds to import."""
+    from lightning.pytorch import Trainer
+
+    return Trainer
 
 
 def _top_level_keys(config_name: str) -> list[str]:

@@ -74,8 +74,8 @@ class Evaluation:
     def __post_init__(self):
         if self.resolution < 2 or min(self.points, self.fit_together) < 1:
             raise ValueError("resolution must be at least 2, points and fit_together at least 1")
-        if min(self.known or 0, self.held_out or 0, self.pictures, self.workers or 0) < 0:
-            raise ValueError("known, held_out, pictures and workers must not be negative")
+        if min(self.known or 0, self.held_out or 0, self.pictures, self.workers or 0, self.seed) < 0:
+            raise ValueError("known, held_out, pictures, workers and seed must not be negative")
 
 
 def build_evaluation(node: dict[str, Any], loss: dict[str, Any]) -> Evaluation:

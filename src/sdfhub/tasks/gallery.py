@@ -41,6 +41,8 @@ def write_gallery(
     columns = len(shown) if animated else COLUMNS
     rows = [shown[start : start + columns] for start in range(0, len(shown), columns)]
     contact_sheet(rows, [], captions, out / "strip.png")
+    for stale in (out / "meshes").glob("[0-9][0-9][0-9].ply"):  # of a longer row
+        stale.unlink()
     for index, mesh in enumerate(meshes):
         write_mesh(*mesh, out / "meshes" / f"{index:03d}.ply")
     write_row(meshes, space.up, out / "meshes.glb")

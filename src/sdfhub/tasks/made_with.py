@@ -15,12 +15,11 @@ PACKAGES = ("sdfhub", "torch", "lightning", "numpy")
 def made_with(trainer: Trainer) -> dict[str, str]:
     """Versions, the device that trained, its threads or processes, and the precision; plain text by name."""
     device = trainer.strategy.root_device
-    is_cpu = device.type == "cpu"
     return {
         "python": ".".join(map(str, sys.version_info[:3])),
         **{name: installed_version(name) for name in PACKAGES},
         "system": f"{platform.system()} {platform.machine()}",
-        "device": _processor() if is_cpu else torch.cuda.get_device_name(device),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
         "threads": str(torch.get_num_threads()),
         "processes": str(trainer.world_size),
         "precision": str(trainer.precision),

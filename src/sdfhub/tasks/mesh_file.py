@@ -17,7 +17,9 @@ in geographic coordinates lie far beyond. GLB knows no others; OBJ is text."""
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Writes a mesh in the format of the path's suffix, whole or not at all; nothing where it has no faces.
+    """Writes a mesh in the format of the path's suffix, whole or not at all.
+
+    Where it has no faces nothing is written, and what an earlier mesh left there goes.
 
     Args:
         vertices: [V, 3], in any frame.
@@ -31,6 +33,8 @@ def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
         import trimesh  # here: slow to import, and every training would wait for it before its first step
 
         _write(trimesh.Trimesh(vertices, faces, process=False), path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _ply_of_doubles(vertices: np.ndarray, faces: np.ndarray) -> bytes:

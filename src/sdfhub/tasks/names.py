@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
 
 WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
-WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "data.source.root", "computing.", "search.")
+WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
+WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile")
 WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
 WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
 WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes")
@@ -33,11 +34,20 @@ def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
 
 
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
-    """Folder name of a multirun: the sweep's own name, so that the same command finds its cells again."""
+    """Folder name of a multirun: the sweep's own name, so that the same command finds its cells again.
+
+    That of a search has a digest of the settings that all its trainings share: their objectives are compared.
+    """
     choices = _root_.hydra.runtime.choices
     if choices.get("search"):
-        return "_".join(["search", *(choices[name] for name in ("search", "data", "category", "scale"))])
+        named = [choices[name] for name in ("search", "data", "category", "scale")]
+        return "_".join(["search", *named, search_digest(_root_=_root_)])
     return choices.get("sweeps") or otherwise
+
+
+def search_digest(*, _root_: DictConfig) -> str:
+    """What tells a search from others: its own trainings, whose settings differ, hear it from `search.of`."""
+    return _root_.search.of or f"of-{_digest_of(_root_)}"
 
 
 def cell_name(*, _root_: DictConfig) -> str:

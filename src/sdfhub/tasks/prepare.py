@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from omegaconf import DictConfig
+from pydantic import NonNegativeInt
 
 from sdfhub.data import store as stores
 from sdfhub.data.sampling import Preparation
@@ -27,16 +28,15 @@ class Prepared:
     store: Store
 
 
-def prepare_data(data: Mapping[str, Any], progress: bool = True) -> Prepared:
+def prepare_data(data: Mapping[str, Any]) -> Prepared:
     """Lists, splits and prepares the shapes that the config's `data` group asks for; prints what came of it.
 
     Args:
         data: the plain `data` group.
-        progress: show a bar.
     """
     source, roles = source_and_split(data)
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    return prepare_split(source, roles, preparation, data, progress)
+    return prepare_split(source, roles, preparation, data)
 
 
 def source_and_split(data: Mapping[str, Any]) -> tuple[Source, Split]:
@@ -48,7 +48,7 @@ def source_and_split(data: Mapping[str, Any]) -> tuple[Source, Split]:
     if held_out < 0:
         raise SdfhubError(f"data.held_out={held_out}: must not be negative")
     source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    seed = check(data["split_seed"], int, "data.split_seed")
+    seed = check(data["split_seed"], NonNegativeInt, "data.split_seed")
     return source, split(source.shapes(), train=shapes, test=held_out, seed=seed)
 
 
@@ -72,10 +72,10 @@ def prepare_part(data: Mapping[str, Any], part: str) -> None:
 
 
 def prepare_split(
-    source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any], progress: bool = True
+    source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any]
 ) -> Prepared:
     """The stored shapes of a given split; prints what came of it."""
-    prepared = stored_split(source, roles, preparation, data, progress)
+    prepared = stored_split(source, roles, preparation, data)
     asked, train, held_out = len(roles.train + roles.test), len(prepared.train), len(prepared.held_out)
     lost = asked - train - held_out
     print(
@@ -86,9 +86,7 @@ def prepare_split(
     return prepared
 
 
-def stored_split(
-    source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any], progress: bool = True
-) -> Prepared:
+def stored_split(source: Source, roles: Split, preparation: Preparation, data: Mapping[str, Any]) -> Prepared:
     """The stored shapes of a given split, without a word."""
     store = stores.prepare(
         source,
@@ -96,7 +94,6 @@ def stored_split(
         preparation,
         root=check(data["store"], str, "data.store"),
         workers=check(data["workers"], int | None, "data.workers"),
-        progress=progress,
     )
     train = [store[shape.id] for shape in roles.train if shape.id in store]
     held_out = [store[shape.id] for shape in roles.test if shape.id in store]

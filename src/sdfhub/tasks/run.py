@@ -55,7 +55,8 @@ def begin_run(
     frames: Mapping[str, Frame],
     up: Literal["y", "z"],
 ) -> None:
-    """Writes down what a run is made of, before it starts."""
+    """Writes down what a run is made of, before it starts; scores of what lay there before go."""
+    (run / "metrics.json").unlink(missing_ok=True)  # else an interrupted run would pass for a finished one
     write_whole(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
     write_whole(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
     write_whole(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))

@@ -170,8 +170,8 @@ def write_distances(
         for head in heads:
             values = [row[head] for row in entry["shapes"]]
             entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}
-    write_whole(out / "metrics.json", json.dumps(result, indent=1))
     write_whole(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
+    write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     for line in lines:
         print("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))

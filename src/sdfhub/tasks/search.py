@@ -20,12 +20,18 @@ def objective(metrics: dict[str, Any]) -> float | None:
         metrics: what `metrics.json` of a run holds.
 
     Returns:
-        Squared units of the normalised frame; None where nothing was judged, such as after a failure.
+        Squared units of the normalised frame, units where distances are judged for want of meshes; None where
+        nothing was judged, such as after a failure.
     """
     judged = [metrics[role]["shapes"] for role in ROLES if metrics.get(role, {}).get("shapes")]
-    excess = [[ShapeScore.model_validate(row).excess for row in rows] for rows in judged]
-    printed = [statistic(values) for values in excess for statistic in (mean, median)]
+    errors = [[_error(row) for row in rows] for rows in judged]
+    printed = [statistic(values) for values in errors for statistic in (mean, median)]
     return geometric_mean(max(value, NOISE) for value in printed) if printed else None
+
+
+def _error(row: dict[str, Any]) -> float:
+    """A shape's excess; the error of its distances where its source holds no meshes."""
+    return row["sdf_error"] if "sdf_error" in row else ShapeScore.model_validate(row).excess
 
 
 def trials_left(total: int, storage: str, study: str) -> int:

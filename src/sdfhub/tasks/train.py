@@ -3,8 +3,9 @@
 import sys
 import warnings
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -12,7 +13,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from sdfhub.data.batches import Loading
@@ -40,9 +41,11 @@ from sdfhub.tasks.run import (
 )
 from sdfhub.tasks.search import objective
 
-FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.up", "trainer.max_")
+FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""
 
+
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "transformer-engine")
 """What Lightning offers and we do not: pieces of a batch are differentiated without a loss scale, and the
@@ -72,6 +75,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         refuse_missing_normals(config["data"])
     refuse_unwritable(run)
     prepared = prepare_data(config["data"])
+    if parts.resume_from:
+        refuse_other_shapes(parts.resume_from, [shape.id for shape in prepared.train])
     loader = SdfDataModule(prepared.train, parts.loading)
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     if parts.weights:
@@ -96,6 +101,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
             f"{parts.resume_from}: its training was finished (trainer.max_epochs would prolong it); judging"
         )
     known = dict(enumerate(prepared.train))
+    model.to(trainer.strategy.root_device)  # Lightning has put it back on the CPU
     codes = model.codes.table.detach()
     metrics = evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
     trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
@@ -112,6 +118,8 @@ def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
     if epochs is None or epochs < 1:
         raise SdfhubError(f"trainer.max_epochs={epochs}: must be at least 1")
     limit = check(trainer.get("max_steps", -1), int, "trainer.max_steps")
+    if limit == 0:
+        raise SdfhubError("trainer.max_steps=0: must be at least 1, or -1 for none")
     return epochs * steps_per_epoch if limit < 0 else min(epochs * steps_per_epoch, limit)
 
 
@@ -121,12 +129,14 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     Raises:
         SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
     """
-    config["seed"] = check(config["seed"], int, "seed")
+    config["seed"] = check(config["seed"], Seed, "seed")
     resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
     every = {
         key: check(value, PositiveInt | None, f"checkpoint.{key}")
         for key, value in config["checkpoint"].items()
     }
+    if unknown := every.keys() - {"every_n_epochs", "snapshot_every_n_epochs"}:
+        raise SdfhubError(f"checkpoint.{min(unknown)}: no such setting")
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
     weights = read_weights(resume_from) if resume_from else None
     model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
@@ -170,6 +180,22 @@ def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
     ]
     if differing:
         raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
+
+
+def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
+    """Refuses to continue a checkpoint where its source now offers other shapes: a code is known by its row.
+
+    Raises:
+        SdfhubError: names the first row that differs.
+    """
+    folder = checkpoint.parent.parent
+    then = read_run(folder)[1]["train"] if (folder / "split.json").is_file() else ids
+    for row, (before, now) in enumerate(zip_longest(then, ids)):
+        if before != now:
+            raise SdfhubError(
+                f"ckpt_path={checkpoint}: the shapes that data= offers have changed: code {row} is that of "
+                f"{before or 'none'}, now it would be that of {now or 'none'}; bring them back, or train anew"
+            )
 
 
 def refuse_missing_normals(data: dict[str, Any]) -> None:

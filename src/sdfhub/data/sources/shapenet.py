@@ -4,7 +4,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from sdfhub.data.mesh import read_mesh
-from sdfhub.data.sources.source import Shape, Source, Triangles, name_of_root, plain_categories, state_of
+from sdfhub.data.sources.source import (
+    Shape,
+    Source,
+    Triangles,
+    folder_safe,
+    name_of_root,
+    plain_categories,
+    state_of,
+)
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError
 
@@ -46,8 +54,8 @@ class ShapeNetSource(Source):
         return with_roles(found, self.train_split, self.test_split)
 
     def load(self, shape: Shape) -> Triangles:
-        category, model = shape.id.split("/")
-        return read_mesh(_mesh_file(self.root / self.synsets[category] / model) or self.root / model)
+        folder = self.root / self.synsets[shape.category] / shape.credits["title"]
+        return read_mesh(_mesh_file(folder) or folder)
 
     def _models(self, category: str) -> Iterator[tuple[Shape, str]]:
         synset = self.synsets[category]
@@ -57,7 +65,7 @@ class ShapeNetSource(Source):
             raise SdfhubError(f"{self.root / synset}: holds no <model>/{LAYOUTS[0]} or <model>/{LAYOUTS[1]}")
         for model, file in files.items():
             credits = {"author": "ShapeNet", "licence": LICENCE, "title": model}
-            shape = Shape(f"{category}/{model}", category, state_of(file), credits=credits)
+            shape = Shape(f"{category}/{folder_safe(model)}", category, state_of(file), credits=credits)
             yield shape, f"{synset}/{model}"
 
 

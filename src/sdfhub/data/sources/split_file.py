@@ -40,8 +40,14 @@ def with_roles(
 
 def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[str]:
     names = set(names_listed(file, role))
-    endings = {ending for name in names for ending in _endings(name)}
-    listed = [shape.id for shape, path in shapes if path in endings or not names.isdisjoint(_endings(path))]
+    paths = {path for _, path in shapes}
+    vague = names - paths  # the others name one path each
+    endings = {ending for name in vague for ending in _endings(name)}
+    listed = [
+        shape.id
+        for shape, path in shapes
+        if path in names or path in endings or not vague.isdisjoint(_endings(path))
+    ]
     if not listed:
         raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
     return listed
