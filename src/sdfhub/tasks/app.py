@@ -170,7 +170,7 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     if "hydra/launcher/ray'" in text:
         return "hydra/launcher=ray: is not installed here; pip install hydra-ray-launcher"
     if text.startswith("Config group override must be"):
-        return "a group takes the name of one of its choices; ~GROUP leaves out an optional one, such as tuned"
+        return "a group takes the name of one of its choices; ~GROUP leaves out one like tuned"
     if text.startswith("Ambiguous value"):
         return f"{text} To train one after another, add -m."
     if text.startswith("Error resolving interpolation '${scale}_"):
