@@ -232,6 +232,16 @@ def test_the_outside_does_not_leak_into_a_dense_cloud_nor_into_one_whose_points_
         assert inside.sum() > 50 and seen.unsigned[inside].all(), "none is surely outside"
 
 
+def test_inside_and_outside_of_a_cloud_whose_gaps_reach_the_corners():
+    points = np.array(trimesh.creation.icosphere(2).vertices) * 0.97
+    assert not is_outside(points, np.zeros((1, 3)), 1.34, 24).any()
+
+
+def test_shares_that_leave_no_row_leave_none():
+    half = Evidence(4095, 0.5, 0.5, (0.01,), 24, 0.1, False, 0.003)
+    assert half.rows - round(half.surface * half.rows) - half._uniform() == 0
+
+
 def test_a_cloud_of_few_different_points_is_refused():
     points = np.repeat(np.random.default_rng(0).uniform(-1, 1, (30, 3)), 3, axis=0)
     with pytest.raises(SdfhubError, match="30 different points"):

@@ -60,6 +60,12 @@ def test_several_shapes_at_once_are_each_alone(space):
     assert torch.equal(both, space.sdf(points, space.codes[[0, 2]]))
 
 
+def test_arrays_with_reversed_axes_are_arrays(space):
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    swapped = points[:, ::-1]
+    assert torch.equal(space.sdf(swapped, 0), space.sdf(swapped.copy(), 0))
+
+
 def test_distances_have_gradients_by_points_and_code_and_the_weights_have_none(space):
     points, code = on_axis(0.5).requires_grad_(), space.code(1).clone().requires_grad_()
     distances = space.sdf(points, code)

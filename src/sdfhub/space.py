@@ -267,7 +267,7 @@ class Space:
 
     def _tensor(self, array: Array) -> Tensor:
         try:
-            return torch.as_tensor(array, dtype=torch.float32, device=self.device)
+            return torch.as_tensor(_contiguous(array), dtype=torch.float32, device=self.device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise SdfhubError(f"expected an array or tensor of numbers, got {array!r:.60}") from error
 
@@ -278,7 +278,12 @@ def _check_count(name: str, value: int, least: int) -> None:
 
 
 def _numbers(array: Array | None) -> np.ndarray | None:
-    return None if array is None else torch.as_tensor(array).detach().cpu().double().numpy()
+    return None if array is None else torch.as_tensor(_contiguous(array)).detach().cpu().double().numpy()
+
+
+def _contiguous(array: Array) -> Array:
+    """The same; a copy of a reversed numpy array, which torch does not take."""
+    return np.ascontiguousarray(array) if isinstance(array, np.ndarray) and array.ndim else array
 
 
 def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:

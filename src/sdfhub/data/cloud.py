@@ -57,8 +57,8 @@ def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> 
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     tree = cKDTree(points)
     near = np.isfinite(tree.query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
-    pieces, _ = label(~near)
-    cell = np.rint((at + EDGE) / (2 * EDGE) * (cells - 1)).astype(np.int64).clip(0, cells - 1)
+    pieces, _ = label(np.pad(~near, 1, constant_values=True))  # afar is free, though the corners may be near
+    cell = np.rint((at + EDGE) / (2 * EDGE) * (cells - 1)).astype(np.int64).clip(0, cells - 1) + 1
     return pieces[tuple(cell.T)] == pieces[0, 0, 0]
 
 

@@ -158,7 +158,7 @@ class Evidence:
         return found if found > self.quiet else 0.0
 
     def _uniform(self) -> int:
-        return round(self.uniform * self.rows)
+        return min(round(self.uniform * self.rows), self.rows - round(self.surface * self.rows))
 
     def _near(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         count = self.rows - round(self.surface * self.rows) - self._uniform()

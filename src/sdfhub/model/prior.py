@@ -49,14 +49,15 @@ class GaussianPrior:
     Source: Ledoit and Wolf 2004, with a given share in place of their estimate.
 
     Args:
-        shrinkage: share of the isotropic covariance (the mean variance in all directions), in (0, 1].
+        shrinkage: share of the isotropic covariance (the mean variance in all directions), 1e-4 to 1: with
+            less, few codes leave a covariance that float32 cannot factor.
     """
 
     shrinkage: float
 
     def __post_init__(self):
-        if not 0 < self.shrinkage <= 1:
-            raise ValueError(f"shrinkage must be in (0, 1], got {self.shrinkage}")
+        if not 1e-4 <= self.shrinkage <= 1:
+            raise ValueError(f"shrinkage must be in [1e-4, 1], got {self.shrinkage}")
 
     def __call__(self, codes: Tensor) -> Normal:
         mean = codes.mean(0)

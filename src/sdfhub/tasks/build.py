@@ -39,9 +39,10 @@ def build(node: Mapping[str, Any], key: str, within: str = "sdfhub", **given: An
     signature = inspect.signature(target).parameters
     for name in arguments:
         if name not in signature:
-            raise SdfhubError(
-                f"{key}.{name}: no such setting; {target.__name__} knows {', '.join(signature)}"
-            )
+            own = [each for each in signature if each not in given]
+            raise SdfhubError(f"{key}.{name}: no such setting; {target.__name__} knows {', '.join(own)}")
+        if name in given:
+            raise SdfhubError(f"{key}.{name}: is no setting; it follows from the rest")
     hints = typing.get_type_hints(target.__init__)
     for name, value in arguments.items():
         where = f"{key}.{name}"
