@@ -142,6 +142,9 @@ def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch,
     printed = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={scan}", "k=1", "resolution=12")
     assert printed.splitlines()[0].split()[0] in IDS
     assert (run / "neighbours" / "scan.xyz" / "strip.png").is_file()
+    np.savez(run / "view.npz", points=away[:200], sensor=np.array([0, 0, 9.0]))
+    complaint = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={run / 'view.npz'}", expect=2)
+    assert "view.npz: is a single view" in complaint
 
 
 MISTAKES = [

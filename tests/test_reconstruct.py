@@ -1,6 +1,7 @@
 """`sdfhub reconstruct` as a user runs it, in a space of balls that stands in for a trained run."""
 
 import json
+import shutil
 import sys
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -241,3 +242,14 @@ def test_results_never_overwrite_a_scan(run, tmp_path):
     trimesh.creation.icosphere().export(tmp_path / "ball.ply")
     with pytest.raises(task.SdfhubError, match="overwrite"):
         reconstructed(run, f"target={tmp_path}", f"out={tmp_path}")
+
+
+def test_results_beside_their_scans_are_no_scans_and_replace_no_stranger(run, scans, tmp_path):
+    shutil.copy(scans / "oriented.npz", tmp_path / "a.npz")
+    words = [f"target={tmp_path}", f"out={tmp_path}", "calibration.shapes=0"]
+    for _ in range(2):
+        assert [found.name for found in reconstructed(run, *words)] == ["a"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.npz", "a.ply"]
+    (tmp_path / "a.json").unlink()
+    with pytest.raises(task.SdfhubError, match="overwrite"):
+        reconstructed(run, f"target={tmp_path / 'a.npz'}", *words[1:])

@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from sdfhub.data.scan import read_scan
+from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery
@@ -19,7 +20,10 @@ def neighbours(config: dict[str, Any]) -> None:
     resolution = check(config["resolution"], int, "resolution")
     space = load(run)
     if Path(str(shape)).is_file():
-        of, shape = Path(str(shape)).name, space.fit_scan(read_scan(Path(str(shape))), "shape")
+        of, scan = Path(str(shape)).name, read_scan(Path(str(shape)))
+        if scan.kind == "view":
+            raise SdfhubError(f"of={shape}: is a single view; see `sdfhub reconstruct`, which takes such")
+        shape = space.fit_scan(scan, "shape")
     else:
         of = space.ids[space.row(shape)]
     found = space.neighbours(shape, check(config["k"], int, "k"))

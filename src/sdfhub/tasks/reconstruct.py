@@ -1,5 +1,6 @@
 """Task `reconstruct`: the shapes behind scans, found in a trained space, as meshes in the scans' frames."""
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -33,6 +34,7 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
         inside = [path]
         if path.is_dir():
             files = sorted(each for each in path.rglob("*") if each.is_file())
+            files = [each for each in files if not is_result(each)]
             inside = [each for each in files if each.suffix.lower() in FORMATS]
             if not inside:
                 raise SdfhubError(f"target={path}: holds no scans ({' '.join(FORMATS)})")
@@ -45,6 +47,15 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     return unique_ids(
         {path: stem if often[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
     )
+
+
+def is_result(path: Path) -> bool:
+    """Whether a mesh is what an earlier command found of a scan: the JSON beside it says so."""
+    try:
+        said = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(said, dict) and "verdict" in said and said.get("mesh") == path.name
 
 
 def read_targets(
@@ -102,8 +113,11 @@ def reconstruct_run(config: dict[str, Any]) -> list[Found]:
     together = check(config["together"], Annotated[int, Field(ge=1)], "together")
     files = scan_files(check(config["target"], str | list[str], "target"))
     for name, path in files.items():
-        if (out / f"{name}.ply").resolve() == path.resolve():
-            raise SdfhubError(f"out={out}: its results would overwrite {path}; choose another folder")
+        result = out / f"{name}.ply"
+        if result.resolve() == path.resolve() or (result.exists() and not is_result(result)):
+            raise SdfhubError(
+                f"out={out}: the result of {path} would overwrite {result}; choose another folder"
+            )
     how = reconstructor(run, config)
     refuse_unwritable(out)
     targets, results = read_targets(how, files, sensor)

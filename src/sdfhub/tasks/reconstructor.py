@@ -211,8 +211,7 @@ def _reconstruct_group(
 
 def _write(found: Found, mesh: Mesh, out: Path) -> None:
     """The mesh first, what is said of it last."""
-    if found.mesh:
-        write_mesh(*mesh, out / found.mesh)
+    write_mesh(*mesh, out / f"{found.name}.ply")
     write_found(found, out)
 
 
