@@ -171,11 +171,14 @@ def test_turns_leave_the_upright_axis_and_go_all_around(up, axis):
 
 def test_the_gaussian_prior_is_the_codes_and_never_flat():
     codes = torch.randn(500, 3) * torch.tensor([1.0, 2.0, 3.0])
-    mean, covariance = GaussianPrior(1e-6)(codes)
+    mean, covariance = GaussianPrior(1e-4)(codes)
     assert torch.allclose(mean, codes.mean(0)) and torch.allclose(covariance, torch.cov(codes.T), atol=1e-3)
     few = GaussianPrior(0.1)(torch.randn(3, 8))
     assert torch.linalg.eigvalsh(few.covariance).min() > 0
     assert torch.linalg.eigvalsh(GaussianPrior(0.1)(torch.ones(1, 8)).covariance).min() > 0
+    assert GaussianPrior(1e-4)(torch.randn(20, 64) / 8).draw(2, seed=0).isfinite().all()
+    with pytest.raises(ValueError, match="shrinkage"):
+        GaussianPrior(1e-7)
 
 
 def test_a_code_is_unusual_by_its_distance_to_the_mean():
