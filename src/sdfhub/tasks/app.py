@@ -185,7 +185,7 @@ def one_line(error: Exception, config_name: str = "config") -> str:
 def _no_such_key(key: str, config_name: str = "config") -> str:
     group, _, below = key.partition(".")
     groups = _groups()
-    if group == "trainer" and below in inspect.signature(lightning_trainer()).parameters:
+    if group == "trainer" and below in _trainer_arguments():
         return f"{key}: conf/ does not set it; write +{key}=..."
     if below and group in groups:
         keys = _keys_of(group)
@@ -199,11 +199,11 @@ def _no_such_key(key: str, config_name: str = "config") -> str:
     return f"there is no group or key {key!r}; {hint}"
 
 
-def lightning_trainer() -> type:
-    """Lightning's Trainer, which takes seconds to import."""
-    from lightning.pytorch import Trainer
+def _trainer_arguments() -> list[str]:
+    """What Lightning's Trainer takes."""
+    from lightning.pytorch import Trainer  # here: it takes seconds to import
 
-    return Trainer
+    return list(inspect.signature(Trainer).parameters)
 
 
 def _top_level_keys(config_name: str) -> list[str]:
