@@ -3,10 +3,11 @@
     python train.py -m search=fft_hosc scale=demo                  # a search, for each row
     python train.py experiment=fft_hosc scale=demo hydra.run.dir=SWEEP_DIR/defaults
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
-    python benchmarks/searches.py SWEEP_DIR --best 3 --enqueue OTHER_DIR   # tried first by another search:
-    python train.py -m search=fft_hosc scale=cpu search.trials=3 hydra.sweep.dir=OTHER_DIR
+    python benchmarks/searches.py trials.csv --only demo_fft_hosc --best 2 --enqueue OTHER_DIR
+    python train.py -m search=fft_hosc scale=cpu search.trials=2 hydra.sweep.dir=OTHER_DIR  # tries them first
 
-A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. The
+A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. A file
+that --csv wrote stands for the searches in it; of two searches of one name the later one counts. The
 objective is what a search lowers: the geometric mean of mean and median excess CD of known and of held-out
 shapes. Beside it both means and medians; all times 10^3. Settings are those in which trainings differ.
 """
@@ -30,7 +31,10 @@ SCORES = ("objective", "known", "known_median", "held_out", "held_out_median", "
 
 
 class Trial(NamedTuple):
-    """A training: rank or name, SCORES times 10^3 (seconds as they are; None: failed), settings by key."""
+    """A training: rank or `defaults`, SCORES times 10^3, settings by key.
+
+    Seconds are as they are; None stands for what was not judged: all of a training that failed.
+    """
 
     name: str
     scores: dict[str, float | None]
@@ -41,12 +45,12 @@ def judged(folder: Path, scores: Scores | None) -> dict[str, float | None]:
     """SCORES of a training's folder."""
     if scores is None:
         return dict.fromkeys(SCORES)
-    excess = {}
+    excess: dict[str, float | None] = dict.fromkeys(SCORES)
     for role, shapes in scores.shapes.items():
         values = [shape.excess * 1e3 for shape in shapes]
         excess |= {role: mean(values), f"{role}_median": median(values)}
     value = objective(json.loads((folder / "metrics.json").read_text(encoding="utf-8")))
-    return {"objective": value * 1e3, **excess, "seconds": scores.training.seconds}
+    return excess | {"objective": value * 1e3, "seconds": scores.training.seconds}
 
 
 def read_search(folder: Path) -> list[Trial]:
@@ -75,6 +79,21 @@ def read_search(folder: Path) -> list[Trial]:
     return ranked
 
 
+def read_csv(file: Path) -> dict[str, list[Trial]]:
+    """The searches of a file that --csv wrote, by name."""
+    searches: dict[str, list[Trial]] = {}
+    try:
+        rows = list(csv.DictReader(io.StringIO(file.read_text(encoding="utf-8"))))
+        for row in rows:
+            name, rank = row.pop("search"), row.pop("trial")
+            scores = {key: float(value) if (value := row.pop(key)) else None for key in SCORES}
+            settings = {key: value for key, value in row.items() if value}
+            searches.setdefault(name, []).append(Trial(rank, scores, settings))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise SdfhubError(f"{file}: not a table of trials as --csv writes it ({error})") from error
+    return searches
+
+
 def shown(value: float | int | str) -> str:
     """Three digits are all that a search can tell."""
     return f"{float(value):.3g}"
@@ -86,7 +105,8 @@ def markdown(trials: list[Trial], best: int) -> str:
     lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for trial in trials:
         if trial.name == "defaults" or int(trial.name) <= best:
-            numbers = ["failed" if v is None else f"{v:.4g}" for v in trial.scores.values()]
+            nothing = "failed" if trial.scores["objective"] is None else ""
+            numbers = [nothing if v is None else f"{v:.4g}" for v in trial.scores.values()]
             lines.append("| " + " | ".join([trial.name, *numbers, *trial.settings.values()]) + " |")
     return "\n".join(lines)
 
@@ -106,8 +126,8 @@ def csv_text(searches: dict[str, list[Trial]]) -> str:
     return text.getvalue()
 
 
-def enqueue(search: Path, other: Path, best: int) -> list[dict[str, float | int]]:
-    """Puts the settings of a search's best trials first into another search, at another scale, say.
+def enqueue(trials: list[Trial], other: Path, best: int) -> list[dict[str, float | int]]:
+    """Puts the settings of the best trials first into another search, at another scale, say.
 
     What the other study has finished or still waits with is not asked again: after an interruption the
     same command brings back the trial that was lost.
@@ -117,18 +137,20 @@ def enqueue(search: Path, other: Path, best: int) -> list[dict[str, float | int]
     """
     import optuna  # an extra, and slow to import
 
-    study = optuna.load_study(study_name="search", storage=f"sqlite:///{search / 'study.db'}")
-    done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
     other.mkdir(parents=True, exist_ok=True)
     storage = f"sqlite:///{other / 'study.db'}"
     target = optuna.create_study(study_name="search", storage=storage, load_if_exists=True)
     known = [
-        trial.params or trial.system_attrs.get("fixed_params")
+        {key: shown(value) for key, value in (trial.params or trial.system_attrs["fixed_params"]).items()}
         for trial in target.trials
         if trial.state.is_finished() or trial.state is optuna.trial.TrialState.WAITING
     ]
-    ranked = sorted(done, key=lambda trial: trial.value)[:best]
-    asked = [trial.params for trial in ranked if trial.params not in known]
+    done = [trial for trial in trials if trial.name != "defaults" and trial.scores["objective"] is not None]
+    asked = [
+        {key: number(value) for key, value in trial.settings.items()}
+        for trial in done[:best]
+        if trial.settings not in known
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         for settings in asked:
@@ -136,25 +158,37 @@ def enqueue(search: Path, other: Path, best: int) -> list[dict[str, float | int]
     return asked
 
 
+def number(text: str) -> float | int:
+    """Optuna refuses a float where a search draws integers."""
+    return int(text) if text.isdigit() else float(text)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("searches", nargs="+", type=Path, help="folders of searches")
+    parser.add_argument("searches", nargs="+", type=Path, help="folders of searches, or files of --csv")
+    parser.add_argument("--only", help="the search of this name")
     parser.add_argument("--best", type=int, default=3)
     parser.add_argument("--csv", type=Path, help="all trials")
     parser.add_argument("--enqueue", type=Path, help="folder of another search, which tries the best first")
     arguments = parser.parse_args()
+    searches: dict[str, list[Trial]] = {}
     try:
-        searches = {folder.name: read_search(folder) for folder in arguments.searches}
+        for source in arguments.searches:
+            searches |= read_csv(source) if source.is_file() else {source.name: read_search(source)}
     except SdfhubError as error:
         parser.error(str(error))
+    if arguments.only:
+        if arguments.only not in searches:
+            parser.error(f"--only {arguments.only}: there are {', '.join(searches)}")
+        searches = {arguments.only: searches[arguments.only]}
     for name, trials in searches.items():
         failed = sum(trial.scores["objective"] is None for trial in trials)
         print(f"\n### {name}: {sum(trial.name != 'defaults' for trial in trials)} trials, {failed} failed\n")
         print(markdown(trials, arguments.best))
     if arguments.enqueue:
-        for folder in arguments.searches:
-            count = len(enqueue(folder, arguments.enqueue, arguments.best))
-            print(f"\n{arguments.enqueue}: {count} settings of {folder.name} come first")
+        for name, trials in searches.items():
+            count = len(enqueue(trials, arguments.enqueue, arguments.best))
+            print(f"\n{arguments.enqueue}: {count} settings of {name} come first")
     if arguments.csv:
         write_whole(arguments.csv, csv_text(searches))
 

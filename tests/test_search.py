@@ -160,17 +160,32 @@ def test_a_search_without_optuna_or_multirun_says_what_is_missing(monkeypatch, c
 
 
 def test_the_best_trials_of_one_search_come_first_in_another(search, tmp_path):
-    from benchmarks.searches import enqueue
+    from benchmarks.searches import csv_text, enqueue, read_csv, read_search
 
     assert search.start("search.trials=4") == 0
     other, sweep = tmp_path / "other", f"hydra.sweep.dir={tmp_path / 'other'}"
     best = sorted(search.rates, key=lambda rate: abs(rate - 1e-3))[:2]
-    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folders()[0], other, 2)] == best
-    assert enqueue(search.folders()[0], other, 2) == [], "they wait already"
+    best = [float(f"{rate:.3g}") for rate in best]
+    file = tmp_path / "trials.csv"
+    file.write_text(csv_text({"demo": read_search(search.folders()[0])}))
+    trials = read_csv(file)["demo"]
+    assert [trial._replace(scores={}) for trial in trials] == [
+        trial._replace(scores={}) for trial in read_search(search.folders()[0])
+    ]
+    assert [settings["optim.lr_decoder"] for settings in enqueue(trials, other, 2)] == best
+    assert enqueue(trials, other, 2) == [], "they wait already"
     search.rates, search.kill_after = [], 1
     assert search.start("scale=cpu", "search.trials=2", sweep) == 130
     assert search.rates == best
-    assert [settings["optim.lr_decoder"] for settings in enqueue(search.folders()[0], other, 2)] == best[1:]
+    assert [settings["optim.lr_decoder"] for settings in enqueue(trials, other, 2)] == best[1:]
     search.rates, search.kill_after = [], 1000
     assert search.start("scale=cpu", "search.trials=2", sweep) == 0
     assert search.rates == best[1:]
+
+
+def test_a_table_of_trials_that_is_none_is_refused_by_name(tmp_path):
+    from benchmarks.searches import read_csv
+
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(SdfhubError, match="t.csv: not a table of trials"):
+        read_csv(tmp_path / "t.csv")
