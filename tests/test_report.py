@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 from sdfhub.report.claims import verdicts
 from sdfhub.report.formats import csv_text, latex, markdown
 from sdfhub.report.meshes import Mesh, reconstruction
@@ -20,7 +21,7 @@ from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
 from sdfhub.report.paper import CLAIMS, COSTS, PRINTED
 from sdfhub.report.pictures import Gallery, packed
-from sdfhub.report.plan import PLAN, enter_cells, locked, read_plan
+from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
 from sdfhub.report.tables import claims_table, tables

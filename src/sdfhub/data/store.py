@@ -29,6 +29,7 @@ from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.locks import locked
 from sdfhub.shapes import ShapeSamples
 
 PASSING = ("error", "crash")
@@ -294,21 +295,8 @@ def _missing(shapes: list[Shape], manifest: dict) -> list[Shape]:
 
 @contextmanager
 def _locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Lets one process at a time fill a store, or several that prepare parts of it (`shared`).
-
-    Where locks do not work, renames alone keep it whole.
-    """
+    """Lets one process at a time fill a store, or several that prepare parts of it (`shared`)."""
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w+") as file:
-        try:
-            import fcntl
-
-            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-            try:
-                fcntl.flock(file, kind | fcntl.LOCK_NB)
-            except BlockingIOError:
-                print(f"store: {folder}: waiting for another process that prepares it", flush=True)
-                fcntl.flock(file, kind)
-        except (ImportError, OSError):
-            pass
+    waiting = f"store: {folder}: waiting for another process that prepares it"
+    with locked(folder / ".lock", shared=shared, waiting=waiting):
         yield

@@ -12,7 +12,7 @@ from sdfhub.data.scan import LEAST, Scan
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import RADIUS, Observation
 
-Frame = Literal["shape", "normalised", "unknown"]
+FrameKind = Literal["shape", "normalised", "unknown"]
 """How a scan lies to the normalised frame: as its own bounding box tells, in it, or nobody knows."""
 
 MOST = 2**16
@@ -41,7 +41,7 @@ class Target:
     scale: float
 
 
-def observed(scan: Scan, evidence: Evidence, frame: Frame, rng: np.random.Generator) -> Target:
+def observed(scan: Scan, evidence: Evidence, frame: FrameKind, rng: np.random.Generator) -> Target:
     """What a scan says of the shape behind it.
 
     Signed samples lie in the normalised frame as they are; a mesh becomes such samples. A view shows no

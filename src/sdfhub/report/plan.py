@@ -5,16 +5,14 @@ seed lie side by side, and a cell whose settings have changed since is supersede
 """
 
 import json
-import os
-import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 from sdfhub.whole_file import write_whole
 
 PLAN, FAILURE = "sweep.json", "failed.json"
@@ -87,37 +85,3 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None =
         commands = dict.fromkeys([*old.commands, *([command[:2000]] if command else [])])
         plan = Plan(cells=list(by_folder.values()), commands=list(commands))
         write_whole(sweep / PLAN, json.dumps(plan.model_dump(), indent=1).encode())
-
-
-@contextmanager
-def locked(path: Path, patience: float = float("inf")) -> Iterator[bool]:
-    """Holds a lock file; gives False where another process still holds it after `patience` seconds.
-
-    The system releases it when the process ends, however it ends. Where locks do not work (some network
-    disks, Windows), every process gets it.
-    """
-    limit = time.monotonic() + patience
-    with path.open("w") as file:
-        while not (ours := _lock(file)) and time.monotonic() < limit:
-            time.sleep(0.1)
-        yield ours
-
-
-def _lock(file) -> bool:
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):
-        pass
-    return True
-
-
-def is_locked(path: Path) -> bool:
-    """Whether another process holds the lock file now."""
-    if not path.exists() or not os.access(path, os.W_OK):
-        return False
-    with locked(path, patience=0) as free:
-        return not free

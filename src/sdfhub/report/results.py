@@ -9,7 +9,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from sdfhub.errors import SdfhubError
-from sdfhub.report.plan import FAILURE, PlannedCell, is_locked, read_plan
+from sdfhub.locks import is_locked
+from sdfhub.report.plan import FAILURE, PlannedCell, read_plan
 
 ROLES = ("known", "held_out")
 

@@ -10,7 +10,8 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig
 
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, locked
+from sdfhub.locks import locked
+from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
 from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from sdfhub.data.scan import FORMATS
 from sdfhub.data.sources.source import unique_ids
-from sdfhub.data.target import Frame, Target
+from sdfhub.data.target import FrameKind, Target
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
@@ -73,7 +73,7 @@ def read_targets(
 
 def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
     """The space of a run or an exported file, and how it is to be used."""
-    frame = check(config["frame"], Frame, "frame")
+    frame = check(config["frame"], FrameKind, "frame")
     space = load(run)
     prior = build(config["prior"], "prior", within="sdfhub.model")
     poses = build(config["poses"], "poses", within="sdfhub.model", up=space.up)

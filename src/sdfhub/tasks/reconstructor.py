@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from sdfhub.data.evidence import Evidence
 from sdfhub.data.scan import read_scan
-from sdfhub.data.target import Frame, Target, observed
+from sdfhub.data.target import FrameKind, Target, observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.model.prior import Normal
@@ -42,7 +42,7 @@ class Reconstructor:
     likely: Normal
     method: Method
     evidence: Evidence
-    frame: Frame
+    frame: FrameKind
     poses: PoseRange | None
     resolution: int
 
