@@ -44,6 +44,17 @@ def excluded(box, observation) -> np.ndarray:
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
+@pytest.mark.parametrize("noise", [0.005, 0.01])
+@pytest.mark.parametrize("count", [1000, 8000])
+def test_gaps_between_noisy_points_are_bare_of_evidence(box, with_normals, noise, count):
+    points, normals = cloud(box, count, noise)
+    rng = np.random.default_rng(1)
+    seen = Evidence(**EVIDENCE).of_cloud(points, normals if with_normals else None, rng)
+    bounded = seen.low != seen.high  # the rest lies on the surface, but for the noise
+    assert np.mean(excluded(box, seen)[bounded] > 0.01) < 0.02
+
+
+@pytest.mark.parametrize("with_normals", [True, False])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_bounds_around_a_cloud_hold_the_truth(box, with_normals, noise):
     points, normals = cloud(box, noise=noise)

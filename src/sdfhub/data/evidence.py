@@ -18,6 +18,9 @@ GAPS = 3
 PLANES = 8
 """Nearest points whose tangent planes a place is at least from: at an edge, those of both sides."""
 
+BOUNDS = 2
+"""Raised when the same scan gives other bounds: what was measured with the old ones counts no more."""
+
 SEALED = 5
 """Median distances between neighbours that no gap of a random cloud reaches across."""
 
@@ -84,13 +87,12 @@ class Evidence:
         at = np.concatenate([self._near(points, rng), rng.uniform(-1, 1, (self._uniform(), 3))])
         distances, nearest = tree.query(at, PLANES)
         distance = distances[:, 0]
-        least = np.sqrt(np.maximum(distance**2 - (GAPS * spacing) ** 2, 0))
+        # the nearest of many scattered points lies nearer than the surface
+        least = np.sqrt(np.maximum(np.maximum(distance - noise, 0) ** 2 - (GAPS * spacing) ** 2, 0))
         if normals is not None:
             apart = np.einsum("ijk,ijk->ij", at[:, None] - points[nearest], normals[nearest])
-            least = np.maximum(least, np.abs(apart).min(axis=1))
-        most = distance
-        if noise:  # the nearest of many scattered points lies nearer than the surface
-            least, most = np.maximum(distance - noise, 0), distance + 3 * noise
+            least = np.maximum(least, np.abs(apart).min(axis=1) - 2 * noise)
+        most = distance + 3 * noise
         # a wall thinner than the flood's own cells would let it through
         reach = max(SEALED * spacing, 3 * noise, cell_radius(self.cells))
         outside, inside = self._sides(points, normals, at, reach)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sdfhub.data.evidence import Evidence
+from sdfhub.data.evidence import BOUNDS, Evidence
 from sdfhub.data.scan import LEAST, Scan
 from sdfhub.data.scanning import surface_scan, view_scan
 from sdfhub.data.shards import StoredShape
@@ -216,7 +216,7 @@ def unseen_shapes(
 def _digest(run: Path, settings: dict[str, Any]) -> str:
     """What a run's weights and the settings of a fit are told apart by."""
     weights = file_sha256(run / "checkpoints" / "last.ckpt")
-    text = json.dumps([weights, settings, RULE, VIEWS], sort_keys=True)
+    text = json.dumps([weights, settings, RULE, VIEWS, BOUNDS], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
