@@ -229,6 +229,12 @@ def test_a_scan_that_does_not_fit_its_frame_says_what_would(box, points, sensor,
         observed(scan, Evidence(**EVIDENCE), frame, np.random.default_rng(0))
 
 
+def test_a_mesh_that_does_not_fit_its_frame_hears_of_meshes(box):
+    scan = Scan(box.vertices * 500, faces=box.faces)
+    with pytest.raises(SdfhubError, match="reaches .* give frame=shape if it is whole"):
+        observed(scan, Evidence(**EVIDENCE), "normalised", np.random.default_rng(0))
+
+
 @pytest.mark.parametrize("count", [4096, 65_536])
 def test_the_outside_does_not_leak_into_a_dense_cloud_nor_into_one_whose_points_come_twice(count):
     """Points of a sphere's surface closer together than the flood's cells, or each given twice."""

@@ -21,6 +21,11 @@ MOST = 2**16
 LARGEST, SMALLEST = 1.2, 0.2
 """Distance of the farthest point from the origin that a scan in the normalised frame may have."""
 
+FAR = 2.5
+"""The same of signed samples, which are also drawn around the shape."""
+
+WHOLE = "give frame=shape if it is whole"
+
 
 @dataclass(frozen=True)
 class Target:
@@ -51,6 +56,8 @@ def observed(scan: Scan, evidence: Evidence, frame: FrameKind, rng: np.random.Ge
         SdfhubError: the scan does not fit the frame; RejectedMesh where its mesh cannot be trusted.
     """
     if scan.faces is not None:
+        if frame == "normalised":
+            refuse_misplaced(scan.points, LARGEST, WHOLE)
         preparation = Preparation(samples=max(4 * evidence.rows, 10_000), surface_points=0)
         prepared = prepare_mesh((scan.points, scan.faces), preparation)
         own = Scan(prepared.points.astype(np.float64), sdf=prepared.sdf.astype(np.float64))
@@ -64,10 +71,10 @@ def observed(scan: Scan, evidence: Evidence, frame: FrameKind, rng: np.random.Ge
     if scan.sdf is None and frame != "normalised":
         center, scale = box_frame(scan.points)
     points = (scan.points - center) * scale
-    reach = float(np.linalg.norm(points, axis=1).max())
-    if not SMALLEST <= reach <= (2.5 if scan.sdf is not None else LARGEST):
-        what = "signed samples belong there" if scan.sdf is not None else "give frame=shape if it is whole"
-        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {what}")
+    if scan.sdf is None:
+        refuse_misplaced(points, LARGEST, WHOLE)
+    else:
+        refuse_misplaced(points, FAR, "signed samples belong there")
     if np.ptp(points, axis=0).max() < SMALLEST:
         raise SdfhubError("its points all lie in one place")
     if scan.sdf is not None:
@@ -80,6 +87,17 @@ def observed(scan: Scan, evidence: Evidence, frame: FrameKind, rng: np.random.Ge
         points, normals = thinned(*distinct(points, scan.normals), rng)
         observation = evidence.of_cloud(points, normals, rng)
     return Target("samples" if scan.sdf is not None else scan.kind, len(points), observation, center, scale)
+
+
+def refuse_misplaced(points: np.ndarray, largest: float, advice: str) -> None:
+    """Refuses points [N, 3] of another frame than the normalised one.
+
+    Raises:
+        SdfhubError: the farthest lies nearer to the origin than SMALLEST or farther than `largest`.
+    """
+    reach = float(np.linalg.norm(points, axis=1).max())
+    if not SMALLEST <= reach <= largest:
+        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {advice}")
 
 
 def distinct(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
