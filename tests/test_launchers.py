@@ -132,3 +132,33 @@ def composed_launcher(launcher: str) -> dict:
 def test_a_part_that_cannot_be_is_refused(part):
     with pytest.raises(SdfhubError, match="must be i/n"):
         prepare_part(composed()["data"], part)
+
+
+def test_the_processes_that_slurm_starts_for_ddp_train_one_cell_together(root, places):
+    words = [sys.executable, "-m", "sdfhub", "train", "-m", "sweeps=smoke", "experiment=fft_siren", "seed=0"]
+    words += ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_epochs=2"]
+    words += ["evaluate.known=0", "evaluate.held_out=0", *SHARED, *places, f"hydra.sweep.dir={root / 'step'}"]
+    job = {"SLURM_JOB_ID": "12345", "SLURM_JOB_NAME": "cell", "SLURM_NTASKS": "2", "SLURM_NNODES": "1"}
+    job |= {"SLURM_NODELIST": "localhost", "SLURM_NODEID": "0", "SLURM_NTASKS_PER_NODE": "2"}
+
+    def step() -> list[str]:
+        tasks = [
+            subprocess.Popen(
+                words,
+                env=os.environ | job | {"SLURM_PROCID": rank, "SLURM_LOCALID": rank, "OMP_NUM_THREADS": "1"},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                cwd=ROOT,
+            )
+            for rank in "01"
+        ]
+        said = [task.communicate(timeout=250)[0] for task in tasks]
+        assert [task.returncode for task in tasks] == [0, 0], said
+        return said
+
+    assert not any("another process is training it" in text for text in step())
+    (metrics,) = (root / "step").glob("*/metrics.json")
+    metrics.unlink()
+    assert all("goes on from last.ckpt" in text for text in step()), "both take the checkpoint up"
+    assert metrics.is_file()

@@ -1,9 +1,11 @@
 """One cell of a sweep: trained once, continued where it was interrupted, and its failure written down."""
 
 import json
+import os
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,9 @@ from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
+
+TASK = "SLURM_PROCID"
+"""Where SLURM says which of a step's processes this is."""
 
 UNTOLD_GROUPS = ("callbacks", "tuned")
 """Groups that say how watched a cell is, or follow from the others."""
@@ -40,17 +45,27 @@ def run_cell(
     folder = Path(hydra.runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
     enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
-    with locked(folder / ".lock", patience=1) as ours:  # a report holds it for a moment, a training for hours
+    with in_hand(folder) as ours:
         if not ours:
             print(f"cell: {folder}: another process is training it", flush=True)
             return {}
         try:
-            # the processes of ddp in a multirun read the config, not what is decided here
-            alone = config.trainer.get("strategy") is None
-            return go_on(train, plain(config), folder, resume=alone)
+            # processes that Lightning starts for ddp read the config, not what is decided here
+            decided = config.trainer.get("strategy") is None or TASK in os.environ
+            return go_on(train, plain(config), folder, resume=decided)
         except Exception as error:
             _write_failure(folder, error)
             return {}
+
+
+def in_hand(folder: Path) -> AbstractContextManager[bool]:
+    """Whether this process may train a cell: no other does, or the others train it together with this one.
+
+    Of the processes that SLURM starts for ddp all come here; the first one holds the lock for them.
+    """
+    if os.environ.get(TASK, "0") != "0":
+        return nullcontext(True)
+    return locked(folder / ".lock", patience=1)  # a report holds it for a moment, a training for hours
 
 
 def go_on(
