@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import pytest
 
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import group_cells
+from tests.browser import empty_page
 
 ROOT = Path(__file__).parents[1]
 
@@ -73,31 +73,13 @@ def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
         assert "FFT/SIREN" in (sweep / "report" / name).read_text()
 
 
-def browser() -> str | None:
-    names = [os.environ.get("SDFHUB_BROWSER", ""), "chromium", "chromium-browser", "google-chrome"]
-    return next((found for name in names if name and (found := shutil.which(name))), None)
-
-
 @pytest.fixture(scope="module")
 def opened(smoked):
     """The smoke sweep's page in a headless browser, and all it said and asked for."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    executable = browser()
-    if executable is None:
-        pytest.skip("no Chromium on PATH or in SDFHUB_BROWSER to look at the page with")
-    flags = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--no-sandbox"] if os.name == "posix" and os.geteuid() == 0 else []
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=executable, args=flags)
-        page = chromium.new_page(viewport={"width": 1280, "height": 900})
-        page.said, page.asked = [], []
-        page.on("console", lambda message: page.said.append(message.text))
-        page.on("pageerror", lambda error: page.said.append(str(error)))
-        page.on("request", lambda request: page.asked.append(request.url))
+    with empty_page(1280, 900) as page:
         page.goto((smoked["sweep"] / "report" / "report.html").as_uri())
         page.wait_for_selector("[data-drawn]", timeout=20_000)
         yield page
-        chromium.close()
 
 
 def test_the_page_renders_in_a_browser_without_errors_or_requests(opened):
@@ -145,4 +127,4 @@ def test_an_injected_script_does_not_run(opened):
         document.body.append(script);
     }""")
     assert opened.evaluate("window.injected") is None
-    assert any(re.search("Content Security Policy", text) for text in opened.said)
+    assert any(re.search("Content Security Policy", text) for _, text in opened.said)

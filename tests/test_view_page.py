@@ -1,7 +1,6 @@
 """The viewer's page in a headless browser."""
 
 import io
-import os
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -11,7 +10,7 @@ from PIL import Image
 import sdfhub
 from sdfhub.tasks.viewer import Viewer
 from tests.ball_space import IDS, write_ball_run
-from tests.test_sweep_smoke import browser
+from tests.browser import empty_page
 from tests.test_view import ball_file, wait_until
 
 READY = "text => document.querySelector('.sdfhub-name')?.textContent === text"
@@ -29,27 +28,17 @@ def viewer(tmp_path_factory):
 @pytest.fixture(scope="module")
 def opened(viewer):
     """The page in a headless browser, and all it said and asked for."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    executable = browser()
-    if executable is None:
-        pytest.skip("no Chromium on PATH or in SDFHUB_BROWSER to look at the page with")
-    flags = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--no-sandbox"] if os.name == "posix" and os.geteuid() == 0 else []
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=executable, args=flags)
-        page = chromium.new_page(viewport={"width": 640, "height": 720})
+    with empty_page(640, 720) as page:
         page.set_default_timeout(60_000)
-        page.wrong, page.asked = [], []
-        page.on("console", lambda said: page.wrong.append(said.text) if said.type == "error" else None)
-        page.on("pageerror", lambda error: page.wrong.append(str(error)))
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.on("websocket", lambda opened: page.asked.append(opened.url))
-        page.goto(
-            f"http://127.0.0.1:{viewer.server.get_port()}/?fixedDpr=0.25"
-        )  # a quarter of the pixels a side
+        # a quarter of the pixels a side
+        page.goto(f"http://127.0.0.1:{viewer.server.get_port()}/?fixedDpr=0.25")
         page.wait_for_function(READY, arg=IDS[0])
         yield page
-        chromium.close()
+
+
+def wrong(page) -> list[str]:
+    """The errors that a page told."""
+    return [text for kind, text in page.said if kind == "error"]
 
 
 def test_the_page_renders_without_errors_and_asks_nobody_but_this_machine(opened):
@@ -59,14 +48,14 @@ def test_the_page_renders_without_errors_and_asks_nobody_but_this_machine(opened
     assert opened.locator("canvas").first.bounding_box()["height"] > 500
     remote = [url for url in opened.asked if urlsplit(url.removeprefix("blob:")).hostname != "127.0.0.1"]
     assert [url for url in remote if not url.startswith("data:")] == [] and len(opened.asked) >= 2
-    assert opened.wrong == []
+    assert wrong(opened) == []
 
 
 def test_a_page_that_tried_to_reach_another_host_could_not(opened):
     attempt = "url => fetch(url).then(() => 'reached', () => 'refused')"
     assert opened.evaluate(attempt, "http://localhost:1/") == "refused"
-    assert any("Content Security Policy" in said for said in opened.wrong)
-    opened.wrong.clear()
+    assert any("Content Security Policy" in said for said in wrong(opened))
+    opened.said.clear()
 
 
 def picture(page) -> np.ndarray:
@@ -96,4 +85,4 @@ def test_a_dropped_file_is_fitted_and_shown(opened, tmp_path):
         devtools.send("Input.dispatchDragEvent", {"type": kind, **place, "data": what})
     opened.wait_for_function(READY, arg=file.name)
     assert opened.get_by_text("off the fitted one").is_visible()
-    assert opened.wrong == []
+    assert wrong(opened) == []
