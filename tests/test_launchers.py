@@ -47,8 +47,8 @@ def places(root) -> list[str]:
 
 @pytest.fixture(scope="module")
 def prepared(root, places) -> subprocess.CompletedProcess:
-    """One half of the smoke sweep's shapes, and a mistake, in two processes."""
-    smoke = ["sweeps=smoke", "data.workers=1", "experiment=fft_siren", "seed=0"]
+    """One half of the smoke sweep's shapes, and a mistake, in two processes, which start others."""
+    smoke = ["sweeps=smoke", "data.workers=2", "experiment=fft_siren", "seed=0"]
     return run("prepare", "-m", "part=1/2,3/2", "hydra/launcher=joblib", *smoke, *SHARED, *places)
 
 

@@ -111,6 +111,9 @@ def _alone(function: Callable, item: object) -> object:
 def _pool(workers: int, function: Callable) -> ProcessPoolExecutor:
     methods = multiprocessing.get_all_start_methods()
     context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+    if multiprocessing.get_start_method(allow_none=True) not in (None, *methods):
+        # a worker of joblib's starts processes in a way of its own, which ours would be told to take up
+        multiprocessing.set_start_method(context.get_start_method(), force=True)
     if context.get_start_method() == "forkserver":  # imports once what each worker would import
         context.set_forkserver_preload([type(function).__module__])
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(function,))
