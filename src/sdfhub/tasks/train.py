@@ -52,6 +52,17 @@ OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "
 loops know float32 and bfloat16."""
 
 
+NO_CONCERN = (
+    ".*does not have many workers.*",
+    ".*number of training batches.*smaller than the logging interval.*",
+    ".*The dirpath has changed.*",  # a continued run has a folder of its own
+    ".*Checkpoint directory .* exists and is not empty.*",
+    ".*ended before the epoch ended.*",  # our loader starts from the step that a checkpoint ends with
+    ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
+)
+"""Lightning's warnings that a user can do nothing about."""
+
+
 @dataclass(frozen=True)
 class Parts:
     """What a config describes, built and so checked before the first shape is prepared."""
@@ -70,6 +81,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     Returns:
         What `metrics.json` holds; empty in processes of a distributed run that are not the first.
     """
+    for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
+        warnings.filterwarnings("ignore", message)
     parts = build_parts(config, run)
     if parts.loading.surface_per_shape:
         refuse_missing_normals(config["data"])
@@ -248,14 +261,6 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
 
 def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
-    warnings.filterwarnings("ignore", ".*does not have many workers.*")
-    warnings.filterwarnings("ignore", ".*number of training batches.*smaller than the logging interval.*")
-    # a continued run has a folder of its own
-    warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
-    warnings.filterwarnings("ignore", ".*Checkpoint directory .* exists and is not empty.*")
-    # our loader starts from the step that a checkpoint ends with, in the middle of an epoch too
-    warnings.filterwarnings("ignore", ".*ended before the epoch ended.*")
-    warnings.filterwarnings("ignore", ".*LeafSpec.*")  # Lightning's own use of a name that torch retires
 
     def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
