@@ -45,8 +45,8 @@ def _lock(file: TextIO, shared: bool) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether another process holds the lock file now."""
+    """Whether another process holds the lock file now, for itself alone."""
     if not path.exists() or not os.access(path, os.W_OK):
         return False
-    with locked(path, patience=0) as free:
+    with locked(path, patience=0, shared=True) as free:  # two that ask do not see each other
         return not free

@@ -89,12 +89,15 @@ class NormalizedMesh:
         _check("vertices", self.vertices, (None, 3), np.float64)
         _check("faces", self.faces, (None, 3), np.int64)
         _check("center", self.center, (3,), np.float64)
-        if not np.isfinite(self.vertices).all() or np.abs(self.vertices).max(initial=0) > 1 + 1e-6:
+        if not np.isfinite(self.vertices).all() or self._reach() > 1 + 1e-6:
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise ValueError("faces: index a vertex that is not there")
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale: must be a positive number, got {self.scale}")
+        if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"center, scale: must be finite, scale positive: {self.center}, {self.scale}")
+
+    def _reach(self) -> float:
+        return float(np.linalg.norm(self.vertices, axis=1).max(initial=0))
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ class ShapeSamples:
     """Signed distances and oriented surface points of one shape, normalised frame.
 
     Args:
-        points: [N, 3] float32, within [-1.2, 1.2]^3 (jitter may leave the cube a little).
+        points: [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little.
         sdf: [N] float32, negative inside.
         surface_points: [M, 3] float32; M = 0 where the source carries none.
         surface_normals: [M, 3] float32, unit length, outward.

@@ -100,7 +100,7 @@ class StepBatches(Dataset):
         if self.shapes_per_step % world:
             raise SdfhubError(
                 f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared by {world} processes; "
-                f"choose a multiple of {world}"
+                f"choose a multiple of {world}, at most {self.rows}"
             )
         self.rank, self.world = rank, world
 

@@ -67,9 +67,9 @@ def cell_radius(cells: int) -> float:
     return 3**0.5 * EDGE / (cells - 1)
 
 
-def areas_of(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
+def areas_of(points: np.ndarray) -> np.ndarray:
     """[N] the area that each point stands for: a disc up to its neighbours, shared with them."""
-    distance = cKDTree(points).query(points, min(neighbours + 1, len(points)))[0]
+    distance = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[0]
     return np.pi * distance[:, -1] ** 2 / (distance.shape[1] - 1)
 
 

@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 
 PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
 """Debian packages and the suffix of the meshes in them; nothing else of them is unpacked."""
@@ -35,6 +36,11 @@ def fetch(root: str | Path) -> None:
     """
     root = Path(root)
     root.mkdir(parents=True, exist_ok=True)
+    with locked(root / ".lock", waiting=f"{root}: waiting for another process that fetches"):
+        _fetch(root)
+
+
+def _fetch(root: Path) -> None:
     for leftover in root.glob(".fetch-*"):  # of a run that was killed
         shutil.rmtree(leftover, ignore_errors=True)
     missing = [package for package, suffix in PACKAGES.items() if not any(root.rglob(f"*{suffix}"))]

@@ -1,8 +1,10 @@
 """Mesh files of the usual formats, read as bare triangles: no materials, no merging, no repair."""
 
 import io
+import json
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
 MAX_BYTES = 1 << 30
 """A larger file is refused before it is read: text formats take some ten times their size in memory."""
+MAX_VERTICES = 50_000_000
+"""Of a glTF's scene: a small file may draw one mesh many times."""
 
 _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
 
@@ -53,10 +57,14 @@ def triangles_of(
         line = bad[0].strip().decode(errors="replace")
         raise RejectedMesh("non_finite_vertices", f"{name} has the line {line!r}")
     try:
-        _check_length(content, suffix)
+        check_length(content, suffix)
+        if suffix in (".glb", ".gltf"):
+            _check_gltf(content, suffix)
         vertices, faces = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
     except RejectedMesh as rejection:
         raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
+    except MemoryError:  # the machine's trouble, not the file's
+        raise
     except Exception as error:  # trimesh raises whatever the broken bytes lead to
         is_foreign = isinstance(error, ImportError)  # it would guess at the encoding of what is no text
         why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
@@ -65,7 +73,7 @@ def triangles_of(
     return vertices, faces
 
 
-def _check_length(content: bytes, suffix: str) -> None:
+def check_length(content: bytes, suffix: str) -> None:
     """Refuses files that end before all that their header promises; trimesh takes what there is."""
     promised, held = 0, len(content)
     if suffix == ".glb":
@@ -82,6 +90,31 @@ def _check_length(content: bytes, suffix: str) -> None:
         held = _lines(content[counts.end() :]) if counts else 0
     if promised > held:
         raise RejectedMesh("corrupt_file", f"ends too early: its header promises {promised}, it holds {held}")
+
+
+def _check_gltf(content: bytes, suffix: str) -> None:
+    """Refuses a glTF whose vertices trimesh would replace by zeros, or that claims more than memory holds."""
+    if suffix == ".glb":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    scene = json.loads(content)
+    primitives = [primitive for mesh in scene.get("meshes", []) for primitive in mesh["primitives"]]
+    packed = {name for each in [scene, *primitives] for name in _extensions(each) if "compression" in name}
+    if packed:
+        raise RejectedMesh("compressed", f"needs {', '.join(sorted(packed))}; export it without compression")
+    accessors = scene.get("accessors", [])
+    if any("bufferView" not in accessor and "sparse" not in accessor for accessor in accessors):
+        raise RejectedMesh("corrupt_file", "claims numbers that it does not hold")
+    counts = [
+        sum(accessors[part["attributes"]["POSITION"]]["count"] for part in mesh["primitives"])
+        for mesh in scene.get("meshes", [])
+    ]
+    drawn = sum(counts[node["mesh"]] for node in scene.get("nodes", []) if "mesh" in node)
+    if drawn > MAX_VERTICES:
+        raise RejectedMesh("too_large", f"draws {drawn:,} vertices, at most {MAX_VERTICES:,} are read")
+
+
+def _extensions(node: dict) -> list[str]:
+    return [*node.get("extensionsRequired", []), *node.get("extensions", {})]
 
 
 def _lines(body: bytes) -> int:
@@ -156,9 +189,12 @@ class _Beside:
 
 
 def buffer_path(folder: Path | None, name: str) -> Path | None:
-    """Where a file that a .gltf names lies, or None where it is not below `folder` or too large."""
-    if folder is None:
-        return None
-    path = (folder / name).resolve()
-    is_below = path.is_relative_to(folder.resolve()) and path.is_file()
-    return path if is_below and path.stat().st_size <= MAX_BYTES else None
+    """Where a file that a .gltf names lies, or None where it is not below `folder` or too large.
+
+    Args:
+        folder: of the .gltf.
+        name: percent-encoded, as the format has it; some exporters write names as they are.
+    """
+    paths = [(folder / each).resolve() for each in (name, unquote(name))] if folder else []
+    found = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
+    return found[0] if found and found[0].stat().st_size <= MAX_BYTES else None

@@ -8,10 +8,11 @@ import torch
 from sdfhub.data.batches import Loading, StepBatches, batch_of, refuse_empty
 from sdfhub.data.shards import COLUMNS
 from sdfhub.data.store import StoredShape
+from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 
-EXTENT = {"outside": 1.2, "inside": 1.2, "surface": 1.0}
-"""Largest number of each array: samples lie in [-1.2, 1.2]^3, surface points and normals in the unit ball.
+EXTENT = {"outside": 1.5, "inside": 1.5, "surface": 1.0}
+"""Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
 Distances beyond it are cut, far outside of what the clamped loss tells apart."""
 
 
@@ -44,6 +45,9 @@ class ResidentBatches(StepBatches):
         table = torch.empty((rows, COLUMNS[name]), dtype=torch.int16, device=self.device)
         for index, shape in enumerate(self.shapes):
             array = torch.from_numpy(shape.read(name, 0, self.counts[name][index]))
+            if array[:, :3].abs().max() > EXTENT[name]:
+                what = f"has points up to {array[:, :3].abs().max():.3g} from 0 along an axis"
+                raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
             fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
             table[self.first[name][index] : self.first[name][index + 1]] = fractions.to(self.device)
         return table

@@ -1,5 +1,6 @@
 """Files of scans: meshes, point clouds with or without normals, signed samples. Read whole, checked once."""
 
+import io
 import re
 import zipfile
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sdfhub.data.mesh import FORMATS as MESHES
-from sdfhub.data.mesh import MAX_BYTES, read_mesh
+from sdfhub.data.mesh import MAX_BYTES, check_length, read_mesh
 from sdfhub.data.sources.deepsdf import npz_array, read_samples
 from sdfhub.errors import RejectedMesh, SdfhubError
 
@@ -129,8 +130,8 @@ def _ply(path: Path) -> Scan:
     import trimesh  # here: slow to import
 
     try:
-        with path.open("rb") as file:
-            cloud = trimesh.load(file, file_type="ply", process=False)
+        check_length(content, ".ply")
+        cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
         columns = cloud.metadata["_ply_raw"]["vertex"]["data"]
         rows = [np.asarray(columns[name], np.float64).reshape(-1) for name in _columns(columns)]
     except Exception as error:  # whatever a cut or damaged file leads trimesh to

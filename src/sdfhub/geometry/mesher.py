@@ -54,7 +54,7 @@ def mesh_fields(
     Raises:
         SdfhubError: a field returned values that are not finite.
     """
-    together = max(1, _NODES_TOGETHER // resolution**3)
+    together = max(1, _NODES_TOGETHER // max(resolution, 1) ** 3)
     for first in range(0, shapes, together):
         group = range(first, min(first + together, shapes))
         grid = _grid(fields, group, resolution, bound, batch, device)

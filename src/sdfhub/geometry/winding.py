@@ -2,6 +2,9 @@
 
 import numpy as np
 
+TOGETHER = 1024
+"""Faces compared with all points at a time, which bounds the memory: some 165 bytes a pair that may meet."""
+
 
 def closed_winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     """How often a closed mesh winds around each point: 1 inside, 0 outside, more where pieces overlap.
@@ -18,6 +21,12 @@ def closed_winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.n
     Returns:
         [N] int64.
     """
+    groups = np.array_split(faces, max(1, -(-len(faces) // TOGETHER)))  # long faces overlap many points
+    return sum(_crossings(vertices, group, points) for group in groups)
+
+
+def _crossings(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[N] of upward rays: faces crossed that look up, less those that look down."""
     face, point = _overlaps(vertices[:, :2], faces, points[:, :2])
     corners, at = faces[face], points[point]
     sides = [_side(vertices, corners[:, i - 2], corners[:, i - 1], at) for i in range(3)]

@@ -40,14 +40,12 @@ def seats(sofa) -> list[Manifold]:
     """The cushions one sits on, sunk into the deck by their rounding so that nothing is hollow below them."""
     placed = [(a, b, sofa.front) for a, b in spans(sofa, 1 if sofa.seat == "bench" else sofa.seats)]
     if chaise := sofa.chaise_span():
-        reach = -0.004 if sofa.armless else 0.014
         front = sofa.front - sofa.chaise_length
         if sofa.seat == "bench" or chaise[1] - chaise[0] > 1.01 * 2 * sofa.half_seat / sofa.seats:
             placed.append((chaise[0], chaise[1], front))
         else:
             at = 0 if sofa.chaise == "left" else -1
             placed[at] = (*placed[at][:2], front)
-        del reach
     made = []
     for left, right, front in placed:
         rear, low = sofa.back_face + sofa.cushion_radius + 0.012, sofa.deck - 0.6 * sofa.cushion_radius

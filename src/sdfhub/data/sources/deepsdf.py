@@ -27,6 +27,9 @@ MAX_BYTES = 1 << 30
 HEADER = 1 << 16
 """Bytes in which an array's header must lie; numpy writes 128."""
 
+REACH = 1.5
+"""Along an axis: samples lie near shapes in the unit ball, or anywhere in the cube [-1, 1]^3."""
+
 _SAMPLES, _PARAMETERS = "SdfSamples", "NormalizationParameters"
 
 
@@ -68,7 +71,7 @@ class DeepSdfSource(Source):
             raise SdfhubError(f"data.source.root={self.root}: holds no .npz files with DeepSDF's samples")
         is_by_synset = any(file.parent.name in self.category_of for file in files)
         files = [file for file in files if not is_by_synset or file.parent.name in self.category_of]
-        self._files = unique_ids({file: self._id(file) for file in files})
+        self._files = unique_ids({file: self._id(file) for file in files}, self.root)
         found = [
             (Shape(id, id.partition("/")[0], _fingerprint(file)), self._path(file))
             for id, file in sorted(self._files.items())
@@ -111,13 +114,17 @@ def read_samples(path: Path) -> ShapeSamples:
     """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does.
 
     Raises:
-        RejectedMesh: corrupt_file, or one_sided_samples where nothing lies outside or nothing inside.
+        RejectedMesh: corrupt_file; one_sided_samples where nothing lies outside or nothing inside;
+            wrong_frame where points lie beyond REACH.
     """
     positive, negative = _rows(path, "pos"), _rows(path, "neg")
     if not len(positive) or not len(negative):
         what = f"{path}: {len(positive)} samples outside, {len(negative)} inside"
         raise RejectedMesh("one_sided_samples", what)
     rows = np.concatenate([positive, negative])
+    if (reach := np.abs(rows[:, :3]).max()) > REACH:
+        what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
+        raise RejectedMesh("wrong_frame", what)
     center, scale = frame_of(path) or (np.zeros(3), 1.0)
     none = np.zeros((0, 3), dtype=np.float32)
     statistics = {"inside": len(negative) / len(rows)}

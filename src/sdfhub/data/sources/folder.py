@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -47,7 +48,7 @@ class FolderSource(Source):
         if not self._files:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")
         found = [
-            (Shape(id, id.partition("/")[0], _fingerprint(file), credits={"title": file.name}), path)
+            (Shape(id, id.partition("/")[0], _fingerprint(file), credits={"title": _shown(file.name)}), path)
             for id, file in sorted(self._files.items())
             for path in [file.relative_to(self.root).with_suffix("").as_posix()]
         ]
@@ -61,7 +62,7 @@ class FolderSource(Source):
     def _by_id(self) -> dict[str, Path]:
         paths = sorted(path for path in self.root.rglob("*") if path.suffix.lower() in FORMATS)
         paths = [path for path in paths if path.is_file() and not self._is_hidden(path)]
-        return unique_ids({path: _id(path.relative_to(self.root)) for path in paths})
+        return unique_ids({path: _id(path.relative_to(self.root)) for path in paths}, self.root)
 
     def _is_hidden(self, path: Path) -> bool:
         return any(part.startswith(".") for part in path.relative_to(self.root).parts)
@@ -72,6 +73,11 @@ def _id(path: Path) -> str:
     return f"{folder_safe(category)}/{folder_safe('_'.join(rest))}"
 
 
+def _shown(name: str) -> str:
+    """A file's name as text: it may hold bytes of another encoding, which JSON would not take."""
+    return os.fsencode(name).decode(errors="replace")
+
+
 def _fingerprint(file: Path) -> str:
     """Hash of a file's content, and of the buffers that a .gltf names."""
     digest = file_sha256(file)
@@ -80,6 +86,6 @@ def _fingerprint(file: Path) -> str:
     try:
         names = [buffer.get("uri", "") for buffer in json.loads(file.read_bytes()).get("buffers", [])]
         buffers = [buffer_path(file.parent, name) for name in names if not name.startswith("data:")]
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError):
         return digest  # reading it will say what is wrong
     return hashlib.sha256("".join([digest, *(file_sha256(b) for b in buffers if b)]).encode()).hexdigest()

@@ -63,6 +63,8 @@ def read_model(archive: Path, member: str) -> bytes:
     try:
         with zipfile.ZipFile(archive) as library:
             return _content(library, member, MAX_MODEL)
+    except MemoryError:
+        raise
     except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
         raise RejectedMesh("corrupt_file", f"{archive}: {member}: {error}") from error
 

@@ -80,7 +80,7 @@ class OpenSource(Source):
         self._models, shapes, seen = {}, [], set()
         for model, measure in measured:
             twin = (model.category, measure.get("twin"))
-            if measure.get("faces", 0) < self._min_faces(model.category) or twin in seen:
+            if measure.get("faces", 0) < self._min_faces(model) or twin in seen:
                 continue
             seen.add(twin)
             shapes.append(self._shape(model, measure["sha256"]))
@@ -116,8 +116,9 @@ class OpenSource(Source):
                 title = f"{below.partition('/')[0]} {file.stem}"
                 yield _Model(category, file, "", title, AIRCRAFT_CREDITS | {"title": title})
 
-    def _min_faces(self, category: str) -> int:
-        return int((self.categories[category].get("aircraft") or {}).get("min_faces", 1))
+    def _min_faces(self, model: _Model) -> int:
+        aircraft = {} if model.member else self.categories[model.category]["aircraft"]
+        return int(aircraft.get("min_faces", 1))
 
     def _shape(self, model: _Model, sha256: str) -> Shape:
         where = f"{model.file.relative_to(self.root).as_posix()}\n{model.member}"
@@ -127,9 +128,10 @@ class OpenSource(Source):
 
     def _measure(self, model: _Model, known: dict[str, dict]) -> dict:
         key = model.key(self.root)
-        if key not in known:
-            known[key] = _measured(model)
-        return known[key]
+        measure = known.get(key) or _measured(model)
+        if measure["faces"]:  # another machine, or another version, may read what this one could not
+            known[key] = measure
+        return measure
 
     def _read_measures(self) -> dict[str, dict]:
         try:
@@ -166,8 +168,8 @@ def _measured(model: _Model) -> dict:
     """Faces, hash, and what tells twins: extents and area. A file that cannot be read has no faces."""
     try:
         vertices, faces = model.triangles()
-    except RejectedMesh as rejection:
-        return {"faces": 0, "problem": str(rejection)}
+    except RejectedMesh:
+        return {"faces": 0}
     corners = vertices[faces]
     extents = corners.max(axis=(0, 1)) - corners.min(axis=(0, 1))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,6 +1,7 @@
 """What every data source offers: a list of shapes, and the mesh or the samples of one of them."""
 
 import hashlib
+import os
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -96,14 +97,22 @@ def folder_safe(text: str) -> str:
     return safe[:100] or "unnamed"
 
 
-def unique_ids(wanted: Mapping[Path, str]) -> dict[str, Path]:
-    """Path of each id; paths that want the same id get some digits of their hash behind it."""
+def unique_ids(wanted: Mapping[Path, str], root: Path | None = None) -> dict[str, Path]:
+    """Path of each id; paths that want the same id get some digits of their hash behind it.
+
+    Args:
+        wanted: id by path.
+        root: what the paths lie below, however it is spelled: the same files then have the same ids.
+    """
     uses = Counter(wanted.values())
-    return {id if uses[id] == 1 else f"{id}-{_digits(path)}": path for path, id in sorted(wanted.items())}
+    below = {path: path.relative_to(root) if root else path for path in wanted}
+    return {
+        id if uses[id] == 1 else f"{id}-{_digits(below[path])}": path for path, id in sorted(wanted.items())
+    }
 
 
 def _digits(path: Path) -> str:
-    return hashlib.sha256(path.as_posix().encode()).hexdigest()[:6]
+    return hashlib.sha256(os.fsencode(path.as_posix())).hexdigest()[:6]
 
 
 def name_of_root(kind: str, root: Path) -> str:

@@ -50,6 +50,11 @@ def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[s
     ]
     if not listed:
         raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
+    there = {ending for path in paths for ending in _endings(path)}
+    lost = sorted(name for name in vague if name not in there and paths.isdisjoint(_endings(name)))
+    if lost:
+        what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
+        print(f"{file}: {what}, such as {lost[0]}", flush=True)
     return listed
 
 
