@@ -197,12 +197,20 @@ def test_a_mistake_is_one_line_that_names_it(override, monkeypatch, capsys, tmp_
         assert word in message
 
 
-@pytest.mark.parametrize("key", ["accumulate_grad_batches=2", "limit_train_batches=5"])
+@pytest.mark.parametrize(
+    "key", ["accumulate_grad_batches=2", "limit_train_batches=5", "limit_train_batches=1"]
+)
 def test_what_would_change_how_steps_are_counted_is_refused(key, tmp_path):
     """Draws and schedules count a step a batch, and all batches of an epoch."""
     name, value = key.split("=")
     with pytest.raises(SdfhubError, match=rf"trainer\.{name}: .*data\.loader\."):
         train_task.build_parts(composed(f"+trainer.{name}={value}"), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["logger", "callbacks", "default_root_dir", "plugins"])
+def test_what_a_run_decides_of_its_trainer_is_no_setting(name, tmp_path):
+    with pytest.raises(SdfhubError, match=rf"trainer\.{name}: is no setting"):
+        train_task.build_parts(composed(f"+trainer.{name}=null"), tmp_path)
 
 
 def test_codes_are_fitted_under_the_clamp_of_the_training(tmp_path):

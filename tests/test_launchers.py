@@ -162,3 +162,27 @@ def test_the_processes_that_slurm_starts_for_ddp_train_one_cell_together(root, p
     metrics.unlink()
     assert all("goes on from last.ckpt" in text for text in step()), "both take the checkpoint up"
     assert metrics.is_file()
+
+
+def test_each_cell_of_a_multirun_with_ddp_has_processes_of_its_own(root, places):
+    words = [
+        "-m",
+        "sweeps=smoke",
+        "experiment=fft_siren",
+        "seed=0,1",
+        "trainer.max_epochs=2",
+        *SHARED,
+        *places,
+    ]
+    words += ["evaluate.known=0", "evaluate.held_out=0", f"hydra.sweep.dir={root / 'two'}"]
+    done = run("train", *words, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert "another process is training it" not in done.stdout
+    cells = read_sweep(root / "two")
+    assert [cell.state for cell in cells] == ["done", "done"]
+    assert [cell.scores.training.made_with["processes"] for cell in cells] == ["2", "2"]
+    broken = run(
+        "train", *words, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "loss.delta=-1"
+    )
+    assert broken.returncode == 1 and "2 of 2 cells failed" in broken.stderr
+    assert "Traceback" not in broken.stderr and "delta" in (broken.stdout + broken.stderr)

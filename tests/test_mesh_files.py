@@ -234,3 +234,49 @@ def test_a_gltf_with_a_senseless_buffer_does_not_keep_a_folder_from_being_listed
     (tmp_path / "bad.gltf").write_text(json.dumps({"buffers": [{"uri": uri}]}))
     (tmp_path / "good.off").write_text(BALL.export(file_type="off"))
     assert len(FolderSource(str(tmp_path)).shapes()) == 2
+
+
+def gltf_of(folder, change) -> None:
+    """Writes model.gltf and its buffers, changed."""
+    for name, content in trimesh.Scene(BALL).export(file_type="gltf").items():
+        (folder / name).write_bytes(content)
+    tree = json.loads((folder / "model.gltf").read_text())
+    change(tree)
+    (folder / "model.gltf").write_text(json.dumps(tree))
+
+
+def test_names_of_buffers_are_percent_encoded(tmp_path):
+    def spaced(tree):
+        for buffer in tree["buffers"]:
+            (tmp_path / buffer["uri"]).rename(tmp_path / f"my {buffer['uri']}")
+            buffer["uri"] = f"my%20{buffer['uri']}"
+
+    gltf_of(tmp_path, spaced)
+    assert len(read_mesh(tmp_path / "model.gltf")[1]) == len(BALL.faces)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed: .*draco"),
+        (lambda tree: [a.pop("bufferView") for a in tree["accessors"]], "claims numbers that it does not"),
+        (lambda tree: tree["nodes"].extend([tree["nodes"][-1]] * 400_000), "too_large: .*vertices"),
+        (lambda tree: tree.clear(), "no_faces|corrupt_file"),
+    ],
+    ids=["compressed", "claimed", "repeated", "nothing"],
+)
+def test_a_gltf_that_is_not_what_it_says_is_refused(tmp_path, change, words):
+    gltf_of(tmp_path, change)
+    with pytest.raises(RejectedMesh, match=words):
+        read_mesh(tmp_path / "model.gltf")
+
+
+def test_trouble_of_the_machine_is_no_fault_of_a_mesh(tmp_path, monkeypatch):
+    (tmp_path / "a.obj").write_text(TRIANGLE)
+
+    def exhausted(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("sdfhub.data.mesh._by_trimesh", exhausted)
+    with pytest.raises(MemoryError):
+        read_mesh(tmp_path / "a.obj")

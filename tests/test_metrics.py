@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from sdfhub.geometry import winding
 from sdfhub.geometry.mesher import mesh_dense
 from sdfhub.geometry.metrics import (
     chamfer,
@@ -127,7 +128,9 @@ def overlapping():
 
 
 @pytest.mark.parametrize("mesh", [icosphere(), overlapping(), cube()], ids=["ball", "overlapping", "cube"])
-def test_winding_numbers_are_the_exact_ones(mesh):
+@pytest.mark.parametrize("together", [7, 10**6])
+def test_winding_numbers_are_the_exact_ones(mesh, together, monkeypatch):
+    monkeypatch.setattr(winding, "TOGETHER", together)
     points = np.random.default_rng(0).uniform(-0.9, 0.9, (3000, 3))
     counted = closed_winding_numbers(*mesh, points)
     assert np.array_equal(counted, np.round(igl.winding_number(*mesh, points)))

@@ -419,3 +419,25 @@ def test_a_significant_difference_needs_intervals_apart_and_noise_is_said(tmp_pa
     found = {one.claim.text: one for one in verdicts(only_group(tmp_path / "near"))}
     surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
     assert (surpasses.state, surpasses.within_noise) == ("holds", True)
+
+
+def test_a_share_of_nothing_decides_no_claim(tmp_path):
+    """Excess can fall below 0 by chance, where a smaller share of it is more."""
+    for method, excess in (("DeepSDF", -4e-7), ("FFT/SIREN", -2e-7), ("FFT/HOSC", -3e-7)):
+        write_cell(tmp_path, planned(method, "off" if method == "DeepSDF" else "on"), [0.05e-3 + excess])
+    shares = [one for one in verdicts(only_group(tmp_path)) if any("share of" in f for f in one.figures)]
+    assert shares and not any(one.state == "holds" for one in shares)
+
+
+def test_a_verdict_that_one_clear_comparison_settles_is_no_noise(tmp_path):
+    text = "FFT/HOSC has the lowest mean CD"
+    for method, cd, spread in (
+        ("FFT/HOSC", 1e-3, 1e-5),
+        ("DeepSDF", 1e-4, 1e-6),
+        ("FFT/SIREN", 0.999e-3, 1e-5),
+    ):
+        for seed, shift in enumerate((-spread, 0, spread)):
+            normals = "off" if method == "DeepSDF" else "on"
+            write_cell(tmp_path, planned(method, normals, seed), [cd + shift])
+    (found,) = [one for one in verdicts(only_group(tmp_path)) if text in one.claim.text][:1]
+    assert (found.state, found.within_noise) == ("does not hold", False)

@@ -278,3 +278,10 @@ def test_a_frame_that_is_none_is_refused(part):
     points = np.random.default_rng(0).uniform(-1, 1, (60, 3))
     with pytest.raises(ValueError, match=next(iter(part))):
         Scan(points, sdf=points[:, 0], **part)
+
+
+def test_a_cut_cloud_in_text_is_refused(tmp_path, box):
+    whole = trimesh.PointCloud(cloud(box, 200)[0]).export(file_type="ply", encoding="ascii")
+    (tmp_path / "cut.ply").write_bytes(b"\n".join(whole.splitlines()[:100]) + b"\n")
+    with pytest.raises(SdfhubError, match="cut off or damaged"):
+        read_scan(tmp_path / "cut.ply")

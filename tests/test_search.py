@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 from sdfhub.report.results import read_sweep
 from sdfhub.tasks import train as train_task
 from sdfhub.tasks.app import one_line, told_by_plugin
-from sdfhub.tasks.names import settings_digest
+from sdfhub.tasks.names import search_digest, settings_digest
 from sdfhub.tasks.search import objective
 from tests.sweep_folders import score
 from tests.test_config import CONF, composed
@@ -125,6 +127,30 @@ def test_searches_under_other_settings_are_other_searches(search):
     assert len(both) == 2
     assert all(folder.name.startswith("search_fft_hosc_procedural_chairs_demo_of-") for folder in both)
     assert [{cell.plan.seed for cell in read_sweep(folder)} for folder in both] in ([{0}, {1}], [{1}, {0}])
+
+
+def test_a_search_with_more_trials_than_before_draws_other_ones(search):
+    assert search.start("search.trials=2") == 0
+    assert search.start("search.trials=4") == 0
+    assert len(set(search.rates)) == 4
+
+
+def test_a_search_is_not_lost_when_what_a_row_decides_changes():
+    def digest(words=(), tau=0.1, seed=0):
+        hydra = {"overrides": {"task": list(words)}}
+        parts = {"scale": {"tau": tau}, "normals": {"tau": "${scale.tau}"}, "seed": seed}
+        return search_digest(_root_=OmegaConf.create({"hydra": hydra, "search": {"of": None}} | parts))
+
+    assert digest() == digest(tau=0.2) == digest(["evaluate.workers=1"])
+    assert len({digest(), digest(seed=1), digest(["normals.tau=0.2"], tau=0.2)}) == 3
+
+
+def test_a_search_that_runs_already_is_refused(search, capsys, tmp_path):
+    folder = tmp_path / "s"
+    folder.mkdir()
+    with locked(folder / ".search.lock", patience=0):
+        assert search.start("search.trials=2", f"hydra.sweep.dir={folder}") == 2
+    assert "another process runs this search" in capsys.readouterr().err and search.rates == []
 
 
 def test_the_objective_of_shapes_without_meshes_is_the_error_of_distances():

@@ -295,3 +295,35 @@ def test_meshes_of_a_folder_go_into_the_store(tmp_path):
     radius = np.linalg.norm(rows[:, :3], axis=1)
     assert np.abs(rows[:, 3] - (radius - 1 / 1.03)).max() < 0.02  # the ball has flat faces
     assert len(stored["folder/ball"].mesh.faces) == len(BALL.faces)
+
+
+def test_ids_do_not_depend_on_how_a_root_is_spelled(tmp_path, monkeypatch):
+    for name in ("m/chair.obj", "m/chair.off"):
+        put(tmp_path / name, BALL.export(file_type=name[-3:]).encode())
+    monkeypatch.chdir(tmp_path)
+    assert ids(FolderSource("m")) == ids(FolderSource(str(tmp_path / "m"))) == ids(FolderSource("./m/../m"))
+
+
+def test_a_file_named_in_another_encoding_is_prepared_once(tmp_path):
+    name = os.fsdecode(b"ch\xe9ise.obj")
+    put(tmp_path / "m" / name)
+    few = Preparation(samples=500, surface_points=100)
+    source = FolderSource(str(tmp_path / "m"))
+    prepare(source, source.shapes(), few, tmp_path / "store", workers=1)
+    (record,) = (tmp_path / "store").glob("**/shape.json")
+    made = record.stat().st_mtime_ns
+    assert len(prepare(source, source.shapes(), few, tmp_path / "store", workers=1)) == 1
+    assert record.stat().st_mtime_ns == made, "the manifest that names it can be read again"
+
+
+def test_names_of_a_split_that_are_not_there_are_told(tmp_path, capsys):
+    put(tmp_path / "m" / "a.obj")
+    split = str(put(tmp_path / "split.json", b'["a", "b.obj", "typo"]'))
+    assert ids(FolderSource(str(tmp_path / "m"), split)) == ["folder/a"]
+    assert "2 of the 3 train shapes it lists are not there, such as b.obj" in capsys.readouterr().out
+
+
+def test_samples_of_another_frame_are_refused(tmp_path):
+    rows = np.random.default_rng(0).uniform(1, 100, (100, 4)).astype(np.float32)
+    with pytest.raises(RejectedMesh, match=r"wrong_frame: .*a\.npz: has points 9\d"):
+        read_samples(samples_file(tmp_path / "a.npz", pos=rows))

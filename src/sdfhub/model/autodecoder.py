@@ -67,7 +67,8 @@ class AutoDecoder(L.LightningModule):
         loss, parts = self.objective(batch, self.progress)
         if not torch.isfinite(loss):
             self._refuse_divergence("loss", parts)
-        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
+        every = self.trainer.log_every_n_steps  # 0: nothing is logged
+        if every and (self.global_step + 1) % every == 0:
             self._log(batch, parts, loss)
         return loss
 

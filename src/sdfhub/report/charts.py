@@ -93,7 +93,7 @@ def strip_chart(series: list[Series], x_label: str, marks: list[tuple[float, str
     height, left = 26 * len(series) + BOTTOM + 20, 190
     across = _Axis(*_widened(min(xs), max(xs)), left, WIDTH - RIGHT, log=True)
     parts = _ticks_below(across, height, x_label)
-    for x, name in marks:
+    for x, name in [mark for mark in marks if mark[0] > 0]:
         place = across.at(x)
         parts.append(f'<line class="mark" x1="{place}" x2="{place}" y1="14" y2="{height - BOTTOM}"/>')
         parts.append(f'<text class="tick" x="{place}" y="10" text-anchor="middle">{escape(name)}</text>')

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sdfhub.report.paper import CLAIMS, Below, Claim
+from sdfhub.report.results import NOISE
 from sdfhub.report.rows import THOUSANDFOLD, Estimate, Group, duration
 
 
@@ -15,7 +16,7 @@ class Verdict:
         claim: what was claimed.
         state: `not tested` where a figure that could decide it is missing.
         figures: the figures behind the verdict, or what is missing, one comparison each.
-        within_noise: confidence intervals over seeds overlap in a comparison behind the verdict.
+        within_noise: confidence intervals over seeds overlap in comparisons without which the verdict falls.
     """
 
     claim: Claim
@@ -50,7 +51,9 @@ def _verdict(claim: Claim, group: Group) -> Verdict:
         state = True if True in known else None if None in known else False
     words = {True: "holds", False: "does not hold", None: "not tested"}[state]
     decisive = [overlap for (_, overlap, _), one in zip(outcomes, known, strict=True) if one is state]
-    noise = state is not None and not claim.apart and any(decisive)
+    # one comparison alone decides that not all hold, or that any does: then only if none is clear it is noise
+    told = any if (claim.needs == "all") is state else all
+    noise = state is not None and not claim.apart and bool(decisive) and told(decisive)
     return Verdict(claim, words, list(dict.fromkeys(text for *_, text in outcomes)), noise)
 
 
@@ -68,6 +71,8 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
             return None, False, f"no shape has a surface: {row.label}"
         sides.append((row.label, value))
     (left, a), (right, b) = sides
+    if below.factor != 1 and below.quantity in THOUSANDFOLD and b.mean <= NOISE:
+        return None, False, f"no more than noise to take a share of: {right} {_told(b, below.quantity)}"
     limit = "" if below.factor == 1 else f"{below.factor:.2g} x "
     holds = a.mean < below.factor * b.mean
     sign = "<" if holds else "not <"

@@ -12,6 +12,9 @@ from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked
 from sdfhub.report.plan import FAILURE, PlannedCell, read_plan
 
+NOISE = 1e-6
+"""Excess that 30,000 points a side cannot tell from none."""
+
 ROLES = ("known", "held_out")
 
 

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.names import cell_name, run_name, run_stamp, search_digest, sweep_name
-from sdfhub.tasks.search import trials_left
+from sdfhub.tasks.search import trials_done, trials_left
 
 
 def configuration_folder() -> Path:
@@ -33,7 +33,7 @@ def register_resolvers() -> None:
     """Makes the functions that configs call known to them, here or in a launcher's worker."""
     # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
     warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
-    for name in (run_name, run_stamp, search_digest, sweep_name, cell_name, trials_left):
+    for name in (run_name, run_stamp, search_digest, sweep_name, cell_name, trials_done, trials_left):
         OmegaConf.register_new_resolver(name.__name__, name, replace=True)
     OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
     # two runs that start in one second must not share a folder

@@ -5,12 +5,14 @@ import inspect
 import typing
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 from omegaconf import DictConfig, OmegaConf
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
+
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

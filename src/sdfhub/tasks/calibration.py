@@ -5,6 +5,7 @@ A run keeps its calibrations in `calibration.json`, one a kind of scan, so that 
 
 import hashlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,7 +191,10 @@ def calibrated(
         entry |= {"residuals": residuals.tolist(), "doubts": doubts.tolist()}
         kept = _read(run / FILE)  # again: another process may have added to it meanwhile
         known = kept.get(key, {}) | known | {str(each): entry | {"shapes": [shape.id for shape in shapes]}}
-        write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+        try:
+            write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+        except OSError as error:  # somebody else's run: what was found serves this command at least
+            print(f"{run / FILE}: is not kept: {error.strerror}", file=sys.stderr)
     return {each: Limits(**known[str(each)]["limits"]) for each in kinds}
 
 

@@ -19,11 +19,11 @@ from sdfhub.tasks.build import plain
 from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
-TASK = "SLURM_PROCID"
-"""Where SLURM says which of a step's processes this is."""
+TASKS = ("SLURM_PROCID", "RANK")
+"""Where SLURM, and torchrun, say which of the processes that they started together this is."""
 
 UNTOLD_GROUPS = ("callbacks", "tuned")
-"""Groups that say how watched a cell is, or follow from the others."""
+"""Groups that say how watched a cell is, or follow from the others unless they are said."""
 
 
 def run_cell(
@@ -50,9 +50,7 @@ def run_cell(
             print(f"cell: {folder}: another process is training it", flush=True)
             return {}
         try:
-            # processes that Lightning starts for ddp read the config, not what is decided here
-            decided = config.trainer.get("strategy") is None or TASK in os.environ
-            return go_on(train, plain(config), folder, resume=decided)
+            return go_on(train, plain(config), folder)
         except Exception as error:
             _write_failure(folder, error)
             return {}
@@ -63,7 +61,7 @@ def in_hand(folder: Path) -> AbstractContextManager[bool]:
 
     Of the processes that SLURM starts for ddp all come here; the first one holds the lock for them.
     """
-    if os.environ.get(TASK, "0") != "0":
+    if any(os.environ.get(name, "0") != "0" for name in TASKS):
         return nullcontext(True)
     return locked(folder / ".lock", patience=1)  # a report holds it for a moment, a training for hours
 
@@ -72,14 +70,12 @@ def go_on(
     train: Callable[[dict[str, Any], Path], dict[str, Any]],
     config: dict[str, Any],
     folder: Path,
-    resume: bool = True,
 ) -> dict[str, Any]:
     """Trains what a plain config describes into a folder, from where an earlier training into it ended.
 
     Args:
         train, folder: as for `run_cell`.
         config: plain.
-        resume: whether a checkpoint in the folder is taken up.
     """
     metrics = finished(folder, config)
     if metrics is not None:
@@ -87,7 +83,7 @@ def go_on(
         return metrics
     (folder / FAILURE).unlink(missing_ok=True)
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    if config["ckpt_path"] is None and checkpoint.is_file() and resume:
+    if config["ckpt_path"] is None and checkpoint.is_file():
         print(f"run: {folder}: goes on from {checkpoint.name}", flush=True)
         config["ckpt_path"] = str(checkpoint)
     return train(config, folder)
@@ -116,7 +112,7 @@ def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedC
         settings={
             key: value
             for key, _, value in said
-            if key not in groups and key != "seed" and not key.startswith(WHERE_NOT_WHAT)
+            if (key not in groups or key == "tuned") and key != "seed" and not key.startswith(WHERE_NOT_WHAT)
         },
         seed=int(config.seed),
     )

@@ -2,6 +2,7 @@
 
 import gc
 import importlib
+import os
 import sys
 
 TASKS = {
@@ -22,6 +23,9 @@ TASKS = {
 def main() -> None:
     """Runs the task that the first argument names with the rest of the command line."""
     task = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if task not in TASKS and "LOCAL_RANK" in os.environ:
+        # Lightning starts the further processes of a training with the words that are left of its own
+        sys.argv.insert(1, task := "train")
     if task in ("-h", "--help"):
         print("usage: sdfhub TASK [key=value ...]; sdfhub TASK --help tells its keys\n")
         print("\n".join(f"  {name:<16}{about}" for name, about in TASKS.items()))

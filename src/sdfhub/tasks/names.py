@@ -19,6 +19,10 @@ WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes")
 """Settings that say where and how watched a cell runs; its result is the same under any of them."""
 
 
+OF_A_ROW = ("activation", "encoding", "normals", "decoder", "conditioning", "optim", "codes", "loss", "scale")
+"""Parts of a config that the rows of a table differ in."""
+
+
 def run_name() -> str:
     """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
     return _joined(HydraConfig.get().runtime.choices)
@@ -46,8 +50,14 @@ def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
 
 
 def search_digest(*, _root_: DictConfig) -> str:
-    """What tells a search from others: its own trainings, whose settings differ, hear it from `search.of`."""
-    return _root_.search.of or f"of-{_digest_of(_root_)}"
+    """What tells a search from others: its own trainings, whose settings differ, hear it from `search.of`.
+
+    What the row decides, which the search's own config does not know yet, counts where the command line sets
+    it: a search is not lost when another row's defaults change.
+    """
+    if _root_.search.of:
+        return _root_.search.of
+    return f"of-{_digest_of(_root_, leave=OF_A_ROW)}"
 
 
 def cell_name(*, _root_: DictConfig) -> str:
@@ -55,12 +65,18 @@ def cell_name(*, _root_: DictConfig) -> str:
     return f"{_joined(_root_.hydra.runtime.choices)}_seed-{_root_.seed}_{_digest_of(_root_)}"
 
 
-def _digest_of(root: DictConfig) -> str:
+def _digest_of(root: DictConfig, leave: tuple[str, ...] = ()) -> str:
+    """The digest of a composed config; parts to `leave` count where the command line sets them."""
     settings = OmegaConf.masked_copy(root, [key for key in root if key != "hydra"])
+    said = [word.lstrip("+~") for word in root.hydra.overrides.task]
     try:
-        return settings_digest(OmegaConf.to_container(settings, resolve=True))
+        settings = OmegaConf.to_container(settings, resolve=True)
     except Exception:  # a broken interpolation is that run's own failure, to be told when it starts
-        return settings_digest({"overrides": list(root.hydra.overrides.task)})
+        return settings_digest({"overrides": said})
+    kept = {key: part for key, part in settings.items() if key not in leave}
+    if leave:
+        kept["overrides"] = sorted(word for word in said if not word.startswith(WHERE_NOT_WHAT))
+    return settings_digest(kept)
 
 
 def settings_digest(config: dict[str, Any]) -> str:

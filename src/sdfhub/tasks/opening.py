@@ -49,9 +49,9 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     path = Path(path)
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")
-    about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
     where = _device(device)
     try:
+        about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
         evidence, method = default_fitting(clamp(about["config"]))
         ids = tuple(about["ids"])
         frames = about["frames"].items()

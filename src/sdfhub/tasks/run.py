@@ -78,9 +78,12 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
         split = json.loads((run / "split.json").read_text(encoding="utf-8"))
     except OSError as error:
         raise SdfhubError(f"run={run}: not a run's folder ({error.strerror}: {error.filename})") from error
-    except (ValueError, yaml.YAMLError) as error:
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
         raise SdfhubError(f"run={run}: config.yaml or split.json is broken: {error}") from error
-    if not isinstance(config, dict) or set(split) != {"train", "held_out"}:
+    are_ids = isinstance(split, dict) and all(
+        isinstance(ids, list) and all(isinstance(id, str) for id in ids) for ids in split.values()
+    )
+    if not isinstance(config, dict) or not are_ids or set(split) != {"train", "held_out"}:
         raise SdfhubError(f"run={run}: config.yaml or split.json is not what training writes")
     return config, split
 

@@ -5,14 +5,14 @@ from typing import Any
 from omegaconf import DictConfig
 
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
+from sdfhub.tasks.build import Seed, check, plain
 from sdfhub.tasks.gallery import write_gallery
 from sdfhub.tasks.opening import beside, load
 
 
 def sample(config: dict[str, Any]) -> None:
     """The task: `config` as conf/sample.yaml has it."""
-    run, seed = check(config["run"], str, "run"), check(config["seed"], int, "seed")
+    run, seed = check(config["run"], str, "run"), check(config["seed"], Seed, "seed")
     out = check(config["out"], str | None, "out")
     resolution = check(config["resolution"], int, "resolution")
     space = load(run)

@@ -4,10 +4,7 @@ import os
 from statistics import geometric_mean, mean, median
 from typing import Any
 
-from sdfhub.report.results import ROLES, ShapeScore
-
-NOISE = 1e-6
-"""Excess that 30,000 points a side cannot tell from none."""
+from sdfhub.report.results import NOISE, ROLES, ShapeScore
 
 
 def objective(metrics: dict[str, Any]) -> float | None:
@@ -42,11 +39,16 @@ def trials_left(total: int, storage: str, study: str) -> int:
         storage: URL of the study's database.
         study: its name there.
     """
+    return max(0, total - trials_done(storage, study))
+
+
+def trials_done(storage: str, study: str) -> int:
+    """How many of a search's trainings have ended, well or not."""
     os.environ.setdefault("SQLALCHEMY_SILENCE_UBER_WARNING", "1")  # of a version that the plugin is bound to
     import optuna  # an extra, and slow to import
 
     try:
         trials = optuna.load_study(study_name=study, storage=storage).trials
     except KeyError:  # no such study yet
-        return total
-    return max(0, total - sum(trial.state.is_finished() for trial in trials))
+        return 0
+    return sum(trial.state.is_finished() for trial in trials)

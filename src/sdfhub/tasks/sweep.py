@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.cells import planned_cell
@@ -42,6 +44,8 @@ class SweepRecord(Callback):
             sys.exit(2)
         if not _is_training(config):
             return
+        if config.hydra.runtime.choices.get("search"):
+            hold_search(Path(config.hydra.sweep.dir))
         try:
             self._planned = planned_cells(config)
         except Exception as error:  # the sweeper composes the same, and tells it better
@@ -52,6 +56,7 @@ class SweepRecord(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         if not _is_training(config):
             return
+        _held.close()
         from sdfhub.tasks.report import write_report  # here: Hydra imports this file at every start
 
         sweep = Path(config.hydra.sweep.dir)
@@ -64,6 +69,20 @@ class SweepRecord(Callback):
         if failed:
             print(f"sdfhub: error: {len(failed)} of {len(cells)} cells failed", file=sys.stderr)
             sys.exit(1)
+
+
+_held = ExitStack()
+"""The lock of the search that this process runs; an interrupted one lets go of it when the process ends."""
+
+
+def hold_search(folder: Path) -> None:
+    """Ends this process where another one runs the same search: both would draw and train the same trials."""
+    _held.close()
+    folder.mkdir(parents=True, exist_ok=True)
+    if not _held.enter_context(locked(folder / ".search.lock", patience=0)):
+        _held.close()
+        print(f"sdfhub: error: {folder}: another process runs this search", file=sys.stderr)
+        sys.exit(2)
 
 
 def refuse_missing_plugins(config: DictConfig) -> None:

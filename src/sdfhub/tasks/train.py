@@ -1,11 +1,12 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
+import os
 import sys
 import warnings
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -13,15 +14,16 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt
 from torch import Tensor
 
 from sdfhub.data.batches import Loading
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
+from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.build import Seed, build, check, plain
 from sdfhub.tasks.callbacks import LossBar, LossLines, TrainingRecord
 from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
@@ -44,8 +46,6 @@ from sdfhub.tasks.search import objective
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""
 
-
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "transformer-engine")
 """What Lightning offers and we do not: pieces of a batch are differentiated without a loss scale, and the
@@ -84,6 +84,8 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
     parts = build_parts(config, run)
+    if must_run_apart(parts.trainer):
+        return train_apart(run)
     if parts.loading.surface_per_shape:
         refuse_missing_normals(config["data"])
     refuse_unwritable(run)
@@ -241,18 +243,20 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     """
     if str(node.get("precision")) in OTHER_PRECISIONS:
         raise SdfhubError(f"trainer.precision={node['precision']}: use 32-true or bf16-mixed")
-    make = build(node, "trainer", within="lightning.pytorch")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
+    ours = {"default_root_dir": run, "logger": logger, "callbacks": callbacks, "plugins": WholeFileIO()}
+    make = build(node, "trainer", within="lightning.pytorch", **ours)
     try:
-        trainer = make(default_root_dir=run, logger=logger, callbacks=callbacks, plugins=WholeFileIO())
-    except (ValueError, TypeError, MisconfigurationException) as error:
+        trainer = make()
+    except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
         hint = "; trainer=auto takes what this machine has" if "ccelerator" in str(error) else ""
         raise SdfhubError(f"trainer: {error}{hint}") from error
     if trainer.accumulate_grad_batches != 1:  # large batches are worked on in pieces anyway
         raise SdfhubError(
             "trainer.accumulate_grad_batches: a step is one batch; raise data.loader.samples_per_shape"
         )
-    if trainer.limit_train_batches != 1.0:  # schedules and draws count all steps of an epoch
+    limit = trainer.limit_train_batches  # 1 means one batch, 1.0 all of them
+    if limit != 1.0 or isinstance(limit, int):  # schedules and draws count all steps of an epoch
         raise SdfhubError(
             "trainer.limit_train_batches: an epoch has data.loader.passes_per_epoch passes; set that"
         )
@@ -269,7 +273,7 @@ def main() -> None:
         if hydra.mode == RunMode.MULTIRUN:
             return objective(run_cell(train, config, hydra))
         for group in ("sweeps", "search"):
-            if name := hydra.runtime.choices.get(group):
+            if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
                 raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
         folder = Path(hydra.runtime.output_dir)
         try:
