@@ -28,32 +28,3 @@ def train(name: str, *overrides: str) -> dict:
     if done.returncode:
         raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
     return json.loads((folder / "metrics.json").read_text())
-
-
-def row(name: str, metrics: dict, role: str = "known") -> str:
-    """A Markdown line for the shapes of a role: CD, floor and excess times 10^3, failures, size, seconds."""
-    summary, training = metrics[role]["summary"], metrics["training"]
-    if summary["cd"]["mean"] is None:
-        cells = ["no surface"] + [""] * 4
-    else:
-        pairs = [
-            ("cd", "mean"),
-            ("cd", "median"),
-            ("floor", "mean"),
-            ("excess", "mean"),
-            ("excess", "median"),
-        ]
-        cells = [f"{summary[key][statistic] * 1e3:.4f}" for key, statistic in pairs]
-    counts = [
-        f"{summary['failed']}/{summary['shapes']}",
-        f"{training['parameters']:,}",
-        f"{training['seconds']:.0f}",
-    ]
-    return f"| {name} | " + " | ".join(cells + counts) + " |"
-
-
-HEAD = (
-    "| run | CD mean | CD median | floor | excess mean | excess median | no surface | parameters "
-    "| seconds |\n"
-    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
-)
