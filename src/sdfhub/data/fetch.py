@@ -36,23 +36,27 @@ def fetch(root: str | Path) -> None:
     """
     root = Path(root)
     root.mkdir(parents=True, exist_ok=True)
+    if not _missing(root):
+        print(f"{root}: both packages are there")
+        return
     with locked(root / ".lock", waiting=f"{root}: waiting for another process that fetches"):
         _fetch(root)
+
+
+def _missing(root: Path) -> list[str]:
+    return [package for package, suffix in PACKAGES.items() if not any(root.rglob(f"*{suffix}"))]
 
 
 def _fetch(root: Path) -> None:
     for leftover in root.glob(".fetch-*"):  # of a run that was killed
         shutil.rmtree(leftover, ignore_errors=True)
-    missing = [package for package, suffix in PACKAGES.items() if not any(root.rglob(f"*{suffix}"))]
-    for package in missing:
+    for package in _missing(root):
         with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
             archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
             unpacked = Path(scratch) / "unpacked"
             count = unpack(archive, unpacked, PACKAGES[package])
             os.rename(unpacked, root / package)
             print(f"{package}: {count} files in {root / package}")
-    if not missing:
-        print(f"{root}: both packages are there")
 
 
 def unpack(archive: Path, folder: Path, suffix: str) -> int:

@@ -45,8 +45,8 @@ class ResidentBatches(StepBatches):
         table = torch.empty((rows, COLUMNS[name]), dtype=torch.int16, device=self.device)
         for index, shape in enumerate(self.shapes):
             array = torch.from_numpy(shape.read(name, 0, self.counts[name][index]))
-            if array[:, :3].abs().max() > EXTENT[name]:
-                what = f"has points up to {array[:, :3].abs().max():.3g} from 0 along an axis"
+            if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
+                what = f"has points up to {reach:.3g} from 0 along an axis"
                 raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
             fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
             table[self.first[name][index] : self.first[name][index + 1]] = fractions.to(self.device)

@@ -128,8 +128,12 @@ class OpenSource(Source):
 
     def _measure(self, model: _Model, known: dict[str, dict]) -> dict:
         key = model.key(self.root)
-        measure = known.get(key) or _measured(model)
-        if measure["faces"]:  # another machine, or another version, may read what this one could not
+        if known.get(key, {}).get("faces"):
+            return known[key]
+        measure = _measured(model)
+        if measure[
+            "faces"
+        ]:  # what cannot be read is tried again: the fault may be this machine's or version's
             known[key] = measure
         return measure
 
