@@ -66,7 +66,7 @@ def test_loops_equal_autograd_through_the_plain_formula(activation, per_shape, p
             size, allowed = want.abs().max(), (rival - want).abs().max()
             assert (
                 have - want
-            ).abs().max() <= 4 * allowed + 6e-6 * size  # long sums, in the processor's order
+            ).abs().max() <= 4 * allowed + 6e-6 * size  # sums of 18,000 terms of either sign
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
