@@ -64,9 +64,9 @@ def test_loops_equal_autograd_through_the_plain_formula(activation, per_shape, p
             *results, strict=True
         ):  # no further from the truth than the plain formula
             size, allowed = want.abs().max(), (rival - want).abs().max()
-            assert (
-                have - want
-            ).abs().max() <= 4 * allowed + 6e-6 * size  # sums of 18,000 terms of either sign
+            # beta's gradient sums 18,000 terms of either sign in float32
+            rounding = 6e-6 if want.ndim == 0 else 2e-6
+            assert (have - want).abs().max() <= 4 * allowed + rounding * size
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
