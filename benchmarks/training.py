@@ -1,6 +1,7 @@
 """Training steps and dense evaluation side by side with DeepSDF's: samples a second, share of the GEMM limit.
 
     python benchmarks/training.py [--shapes 4] [--samples 4096] [--rounds 5] [--threads N] [overrides]
+    python benchmarks/training.py --device cuda --shapes 64 --samples 16384
 
 Every round times one step of each rival, one after the other, so that a machine's moods hit all alike;
 printed are medians over the rounds. DeepSDF's step is re-implemented here from its description: its network
@@ -9,6 +10,12 @@ prior |z|, Adam, and its data path, one npz file a shape read anew at every step
 draw of their samples from the store. Only samples with a signed distance are counted: what normals cost is
 on our account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
 decoder, timed in the same rounds.
+
+On a GPU our samples lie in its memory and the decoder is compiled, as `trainer=gpu` does it; DeepSDF's step
+is given samples that wait on the device, as if its loaders took no time, and works on a batch in four parts
+(its `batch_split`), or it would not fit. float32 products are TF32 there, for all. The second limit:
+the bytes that have to move if every product and every pass between two of them reads what it needs and
+writes what it makes once, at the rate of a copy.
 """
 
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
@@ -30,6 +37,7 @@ from torch import nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.resident import ResidentBatches
 from sdfhub.model.computing import keep_freed_memory
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
@@ -94,10 +102,12 @@ class ReferenceDecoder(nn.Module):
 class ReferenceStep:
     """One step of DeepSDF's published training."""
 
-    def __init__(self, files: list[Path], samples: int):
-        self.files, self.samples = files, samples
-        self.decoder = ReferenceDecoder()
-        self.codes = nn.Embedding(len(files), 256, max_norm=1.0)
+    def __init__(self, files: list[Path], samples: int, device: torch.device):
+        self.files, self.samples, self.device = files, samples, device
+        self.decoder = ReferenceDecoder().to(device)
+        self.codes = nn.Embedding(len(files), 256, max_norm=1.0).to(device)
+        self.parts = 1 if device.type == "cpu" else 4
+        self.waiting = None if device.type == "cpu" else self._read()
         nn.init.normal_(self.codes.weight, 0, 1 / 16)
         groups = [
             {"params": self.decoder.parameters(), "lr": 5e-4},
@@ -115,33 +125,49 @@ class ReferenceStep:
                 drawn.append(rows[(torch.rand(self.samples // 2) * len(rows)).long()])
         return torch.cat(drawn)
 
+    def _read(self) -> torch.Tensor:
+        """[B * N, 4] samples of all shapes."""
+        return torch.cat([self._load(file) for file in self.files]).to(self.device)
+
     def __call__(self) -> None:
-        rows = torch.stack([self._load(file) for file in self.files]).reshape(-1, 4)
-        which = torch.arange(len(self.files)).repeat_interleave(self.samples)
-        target = rows[:, 3:].clamp(-0.1, 0.1)
+        rows = self._read() if self.waiting is None else self.waiting
+        which = torch.arange(len(self.files), device=self.device).repeat_interleave(self.samples)
         self.optimizer.zero_grad()
-        codes = self.codes(which)
-        predicted = self.decoder(torch.cat([codes, rows[:, :3]], dim=1)).clamp(-0.1, 0.1)
-        loss = F.l1_loss(predicted, target, reduction="sum") / len(rows)
-        loss = loss + 1e-4 * codes.norm(dim=1).sum() / len(rows)
-        loss.backward()
+        for some, of_shapes in zip(rows.chunk(self.parts), which.chunk(self.parts), strict=True):
+            target = some[:, 3:].clamp(-0.1, 0.1)
+            codes = self.codes(of_shapes)
+            predicted = self.decoder(torch.cat([codes, some[:, :3]], dim=1)).clamp(-0.1, 0.1)
+            loss = F.l1_loss(predicted, target, reduction="sum") / len(rows)
+            loss = loss + 1e-4 * codes.norm(dim=1).sum() / len(rows)
+            loss.backward()
         self.optimizer.step()
 
 
 class OurStep:
     """One step of what a composed config describes, without Lightning's loop around it."""
 
-    def __init__(self, shapes: list[RandomShape], samples: int, surface: int, choice: list[str], bf16: bool):
+    def __init__(
+        self,
+        shapes: list[RandomShape],
+        samples: int,
+        surface: int,
+        choice: list[str],
+        bf16: bool,
+        device: torch.device,
+    ):
         config = plain(compose("config", overrides=choice))
-        self.model = build_autodecoder(config, rows=len(shapes), steps=1000)
-        self.batches = StepBatches(shapes, Loading(len(shapes), samples, surface, 1, 0, Augmentation(), 0))
+        self.model = build_autodecoder(config, rows=len(shapes), steps=1000).to(device)
+        self.model.on_fit_start()
+        loading = Loading(len(shapes), samples, surface, 1, 0, Augmentation(), 0)
+        on_cpu = device.type == "cpu"
+        self.batches = StepBatches(shapes, loading) if on_cpu else ResidentBatches(shapes, loading, device)
         configured = self.model.configure_optimizers()
         self.optimizer, self.bf16, self.step = configured["optimizer"], bf16, 0
 
     def __call__(self) -> None:
         batch = self.batches[self.step]
         self.optimizer.zero_grad()
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+        with torch.autocast(batch.sdf.device.type, torch.bfloat16, enabled=self.bf16):
             loss, _ = self.model.objective(batch, progress=0.5)
         loss.backward()
         self.optimizer.step()
@@ -154,14 +180,21 @@ class OurStep:
         points = 3 * (loading.samples_per_shape + 2 * loading.surface_per_shape)
         return operations_per_point(self.model.decoder) * points * self.batches.rows
 
+    def bytes(self) -> float:
+        """What products and passes between them read and write, once each; see `bytes_per_point`."""
+        loading = self.batches.loading
+        signed, surface = bytes_per_point(self.model.decoder, 2 if self.bf16 else 4)
+        each = signed * loading.samples_per_shape + surface * loading.surface_per_shape
+        return each * self.batches.rows
+
 
 class OurField:
     """Dense evaluation of a decoder, as meshing calls it."""
 
-    def __init__(self, choice: list[str], points: int):
+    def __init__(self, choice: list[str], points: int, device: torch.device):
         config = plain(compose("config", overrides=choice))
-        self.model, self.bf16 = build_autodecoder(config, rows=1).eval(), False
-        self.points = torch.rand(1, points, 3) - 0.5
+        self.model, self.bf16 = build_autodecoder(config, rows=1).eval().to(device), False
+        self.points = torch.rand(1, points, 3, device=device) - 0.5
 
     @torch.no_grad()
     def __call__(self) -> None:
@@ -178,11 +211,43 @@ def operations_per_point(decoder) -> int:
     return sum(2 * sum(layer.columns[:2]) * layer.linear.out_features for layer in decoder.layers)
 
 
+def bytes_per_point(decoder, size: int) -> tuple[int, int]:
+    """Fewest bytes of a training step per signed sample, and per surface point with its gradient.
+
+    A hidden layer with I inputs and W outputs, each number of `size` bytes. A signed sample: the product
+    reads I and writes W, the pass after it reads W and writes the next I; backward the pass reads I and W and
+    writes W, the products read W twice and I, and write I. A surface point has its slopes (W) written too;
+    its gradient takes a product (reads W, writes I) and a pass (2 W, W); their backward two products (2 I,
+    2 W) and a pass (3 W, 2 W), and the backward of its value reads W more.
+    """
+    signed = surface = 0
+    for layer in decoder.layers[:-1]:
+        reads, writes = max(sum(layer.columns[:2]), 1), layer.linear.out_features
+        signed += (5 * reads + 6 * writes) * size
+        surface += (8 * reads + 19 * writes) * size
+    return signed, surface
+
+
+class Copy:
+    """The other limit: a copy of a GiB."""
+
+    def __init__(self, device: torch.device):
+        self.a = torch.empty(2**29, dtype=torch.uint8, device=device).random_()
+        self.b = torch.empty_like(self.a)
+
+    def __call__(self) -> None:
+        self.b.copy_(self.a)
+
+    def bytes(self) -> float:
+        return 2 * self.a.numel()
+
+
 class Product:
     """The limit: one matrix product of a layer's size."""
 
-    def __init__(self, width: int, dtype: torch.dtype, rows: int):
-        self.a, self.b = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
+    def __init__(self, width: int, dtype: torch.dtype, rows: int, device: torch.device):
+        self.a = torch.randn(rows, width, device=device).to(dtype)
+        self.b = torch.randn(width, width, device=device).to(dtype)
 
     def __call__(self) -> None:
         torch.mm(self.a, self.b)
@@ -201,17 +266,20 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     deepsdf = ["experiment=deepsdf", *args.overrides]
     surface = args.samples // 4  # as at scale=paper
     rows = args.shapes * args.samples
-    made: dict[str, object] = {"DeepSDF, reference": ReferenceStep(files, args.samples)}
+    device = torch.device(args.device)
+    made: dict[str, object] = {"DeepSDF, reference": ReferenceStep(files, args.samples, device)}
     for bf16 in (False, True):
         suffix = ", bf16" if bf16 else ""
         made |= {
-            "decoder=deepsdf" + suffix: OurStep(shapes, args.samples, 0, deepsdf, bf16),
+            "decoder=deepsdf" + suffix: OurStep(shapes, args.samples, 0, deepsdf, bf16, device),
             "paper_585k, HOSC, normals=off" + suffix: OurStep(
-                shapes, args.samples, 0, ["normals=off", *paper], bf16
+                shapes, args.samples, 0, ["normals=off", *paper], bf16, device
             ),
-            "paper_585k, HOSC, normals=on" + suffix: OurStep(shapes, args.samples, surface, paper, bf16),
+            "paper_585k, HOSC, normals=on" + suffix: OurStep(
+                shapes, args.samples, surface, paper, bf16, device
+            ),
             "paper_585k, SIREN, normals=on" + suffix: OurStep(
-                shapes, args.samples, surface, ["activation=siren", *paper], bf16
+                shapes, args.samples, surface, ["activation=siren", *paper], bf16, device
             ),
         }
     fields = {
@@ -219,7 +287,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
         "paper_585k, HOSC": paper,
         "paper_585k, SIREN": ["activation=siren", *paper],
     }
-    made |= {f"{name}, evaluation": OurField(choice, rows) for name, choice in fields.items()}
+    made |= {f"{name}, evaluation": OurField(choice, rows, device) for name, choice in fields.items()}
     return made
 
 
@@ -231,6 +299,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=4096)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, help="default: what torch takes")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
     if args.threads:
@@ -243,25 +312,39 @@ def main() -> None:
         initialize_config_dir(str(CONF), version_base=None),
     ):
         steps = rivals(args, Path(folder))
-        limits = limits_of(steps)
+        limits = limits_of(steps, torch.device(args.device))
         times = {name: [] for name in (*steps, *limits)}
         for round_ in range(args.rounds + 1):  # the first warms up
             for name, step in (steps | limits).items():
-                start = time.perf_counter()
-                step()
+                taken = seconds_of(step, args.device == "cuda")
                 if round_:
-                    times[name].append(time.perf_counter() - start)
+                    times[name].append(taken)
     report(args, steps, limits, {name: statistics.median(taken) for name, taken in times.items()})
 
 
-def limits_of(steps: dict[str, object]) -> dict[tuple, Product]:
-    """The products to measure, by width and whether they are bfloat16."""
-    made = {}
+def seconds_of(step, on_gpu: bool) -> float:
+    """How long a step takes; on a GPU the mean of ten after one, as the first may compile."""
+    if not on_gpu:
+        start = time.perf_counter()
+        step()
+        return time.perf_counter() - start
+    step()
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    for _ in range(10):
+        step()
+    torch.cuda.synchronize()
+    return (time.perf_counter() - start) / 10
+
+
+def limits_of(steps: dict[str, object], device: torch.device) -> dict[object, Product | Copy]:
+    """The products to measure, by width and whether they are bfloat16, and on a GPU a copy."""
+    made: dict[object, Product | Copy] = {} if device.type == "cpu" else {"copy": Copy(device)}
     for step in steps.values():
         if hasattr(step, "operations"):
             key = limit_of(step)
-            together = step.model.computing.together(torch.device("cpu"))
-            made[key] = Product(key[0], torch.bfloat16 if key[1] else torch.float32, together)
+            together = step.model.computing.together(device)
+            made[key] = Product(key[0], torch.bfloat16 if key[1] else torch.float32, together, device)
     return made
 
 
@@ -273,19 +356,28 @@ def limit_of(step) -> tuple[int, bool]:
 def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -> None:
     """Prints Markdown tables."""
     rows = args.shapes * args.samples
+    copy = limits.pop("copy", None)
     rate = {key: product.operations() / seconds[key] for key, product in limits.items()}
-    print(f"{torch.get_num_threads()} threads, {args.shapes} shapes x {args.samples} samples a step")
+    device = f"{torch.get_num_threads()} threads" if copy is None else torch.cuda.get_device_name()
+    print(f"{device}, {args.shapes} shapes x {args.samples} samples a step")
     for (width, bf16), value in rate.items():
         dtype = "bfloat16" if bf16 else "float32"
         print(f"product {width} wide, {dtype}: {value / 1e9:.0f} G operations a second")
-    print("\n| step | samples/s | times DeepSDF | share of the product's rate |\n| --- | --- | --- | --- |")
+    if copy:
+        print(f"copy: {copy.bytes() / seconds['copy'] / 1e9:.0f} GB a second, read and written")
+    memory = " | of the copy's" if copy else ""
+    print(f"\n| step | samples/s | times DeepSDF | share of the product's rate{memory} |")
+    print("| --- | --- | --- | --- |" + " --- |" * bool(copy))
     reference = seconds["DeepSDF, reference"]
     for name, step in steps.items():
-        share = ""
+        shares = [0.0] * (1 + bool(copy))
         if hasattr(step, "operations"):
-            share = f"{step.operations() / seconds[name] / rate[limit_of(step)]:.2f}"
+            shares[0] = step.operations() / seconds[name] / rate[limit_of(step)]
+        if copy and hasattr(step, "bytes"):
+            shares[1] = step.bytes() / seconds[name] / (copy.bytes() / seconds["copy"])
         times = "" if isinstance(step, OurField) else f"{reference / seconds[name]:.2f}"
-        print(f"| {name} | {rows / seconds[name]:,.0f} | {times} | {share} |")
+        cells = " | ".join(f"{share:.2f}" if share else "" for share in shares)
+        print(f"| {name} | {rows / seconds[name]:,.0f} | {times} | {cells} |")
     for bf16 in ("", ", bf16"):
         on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
         print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")
