@@ -3,9 +3,10 @@
     python benchmarks/meshing.py                 # 4 shapes a space: minutes
     python benchmarks/meshing.py --whole         # 100 shapes a space: most of an hour
 
-Trains a small space (5 x 64) of each procedural category once, and keeps it below outputs/benchmarks; beside
-them a ReLU space without encoding, one that has hardly begun to train, and one untrained: their rough
-fields are where a piece of surface is most easily missed. Prints two Markdown tables.
+Trains a space of each procedural category once, with the decoder and the settings of scale=cpu_200, and keeps
+it below outputs/benchmarks; beside them a ReLU space without encoding, one that has hardly begun to train,
+and one untrained: their rough fields are where a piece of surface is most easily missed. Prints two Markdown
+tables.
 
 Compared: each shape's mesh against its dense twin, at 96^3 (--compare), where the coarsest cells are larger
 than at 256^3 (24 an axis against 32). Timed: seconds of one core (process time: what other
@@ -34,10 +35,8 @@ from sdfhub.tasks.run import build_autodecoder, put_weights, read_run, read_weig
 TOLERANCE = 1e-6
 SMALL = [
     "scale=cpu_200",
-    "decoder.width=64",
     "data.held_out=0",
     "data.preparation.samples=50000",
-    "trainer.max_epochs=40",
     "callbacks=none",
     "evaluate.known=0",
 ]
