@@ -19,7 +19,7 @@ from sdfhub.tasks import calibration as calibrations
 from sdfhub.tasks import reconstruct as task
 from sdfhub.tasks.calibration import Alike, Calibration, Limits
 from sdfhub.tasks.reconstructor import Found
-from sdfhub.tasks.run import begin_run, build_autodecoder
+from sdfhub.tasks.run import begin_run, build_autodecoder, read_run
 from tests.test_config import composed
 from tests.test_reconstruction import ball
 from tests.test_training import batches
@@ -105,6 +105,15 @@ def test_a_scan_that_fails_later_leaves_what_was_found_of_it(run, scans, tmp_pat
     assert (tmp_path / "found" / "bare.json").read_bytes() == before
 
 
+class Fitter:
+    """Finds the same of every target."""
+
+    evidence = None
+
+    def judged(self, targets):
+        return np.tile([1.0, 2.0], (len(targets), 1))
+
+
 def test_a_file_gives_the_same_code_alone(run, scans, tmp_path):
     common = f"out={tmp_path}", "calibration.shapes=0"
     all_of, alone = (reconstructed(run, f"target={at}", *common) for at in (scans, scans / "bare.npy"))
@@ -123,6 +132,21 @@ def test_limits_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypat
     monkeypatch.setattr(calibrations, "unseen_shapes", None)  # a second measurement would fail
     again = reconstructed(run, f"target={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
     assert again == first
+
+
+def test_limits_that_cannot_be_kept_serve_the_command_that_measured_them(scans, run, monkeypatch, capsys):
+    def refused(path, text):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(calibrations, "write_whole", refused)
+    monkeypatch.setattr(calibrations, "FILE", "elsewhere.json")
+    monkeypatch.setattr(Alike, "targets", lambda self, shapes, evidence: shapes)
+    measured = calibrations.calibrated(
+        run, *read_run(run), Calibration(3, 3.0, 2.0), [Alike("samples", 0, 0.0)], Fitter(), {}, {}
+    )
+    assert measured == {Alike("samples", 0, 0.0): Limits(2.0, 4.0)}
+    assert "elsewhere.json: is not kept: Permission denied" in capsys.readouterr().err
+    assert not (run / "elsewhere.json").exists()
 
 
 def test_without_the_runs_data_there_are_meshes_but_no_verdicts(run, scans, tmp_path, monkeypatch, capsys):

@@ -216,6 +216,9 @@ def test_principal_directions_are_orthogonal_and_as_long_as_codes_spread_along_t
         (lambda space: space.mesh(0, resolution=2.5), "resolution=2.5: must be a whole number"),
         (lambda space: space.interpolate(0, 1, 1), "steps=1"),
         (lambda space: space.sample(0), "n=0"),
+        (lambda space: space.sample(2, seed=-1), "seed=-1"),
+        (lambda space: space.sample(2, seed="a"), "seed='a'"),
+        (lambda space: space.mesh(0, resolution=0), "resolution=0"),
         (lambda space: space.neighbours(0, 0), "k=0"),
     ],
 )
@@ -265,6 +268,24 @@ def test_a_run_without_frames_meshes_in_the_normalised_frame(run, tmp_path):
     space = sdfhub.load(old)
     assert space.metrics is None
     assert np.allclose(np.linalg.norm(space.mesh(IDS[0], 16)[0], axis=1), RADII[0], atol=0.05)
+
+
+@pytest.mark.parametrize("content", ["[]", '{"train": 3, "held_out": []}', '{"train": [1]}', "null", "{"])
+def test_a_split_that_training_did_not_write_is_named(run, tmp_path, content):
+    odd = shutil.copytree(run, tmp_path / "odd")
+    (odd / "split.json").write_text(content)
+    with pytest.raises(SdfhubError, match=r"config.yaml or split.json is (broken|not what training writes)"):
+        sdfhub.load(odd)
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", '{"up": "z"}', '{"up": "x", "shapes": {}}', '{"up": "z", "shapes": 3}']
+)
+def test_frames_that_training_did_not_write_are_refused_in_one_line(run, tmp_path, content):
+    odd = shutil.copytree(run, tmp_path / "odd")
+    (odd / "frames.json").write_text(content)
+    with pytest.raises(SdfhubError, match="odd"):
+        sdfhub.load(odd)
 
 
 def test_a_folder_that_is_no_run_a_missing_one_and_a_device_that_is_not_there_are_named(run, tmp_path):

@@ -263,6 +263,7 @@ class Space:
     def sample(self, n: int, seed: int = 0) -> Tensor:
         """Codes [n, L] of new shapes, drawn from the distribution of the known ones."""
         _check_count("n", n, 1)
+        _check_count("seed", seed, 0)
         return self.distribution.sample(n, seed)
 
     def _tensor(self, array: Array) -> Tensor:
