@@ -144,7 +144,7 @@ def test_limits_that_cannot_be_kept_serve_the_command_that_measured_them(scans, 
     measured = calibrations.calibrated(
         run, *read_run(run), Calibration(3, 3.0, 2.0), [Alike("samples", 0, 0.0)], Fitter(), {}, {}
     )
-    assert measured == {Alike("samples", 0, 0.0): Limits(2.0, 4.0)}
+    assert measured == {Alike("samples", 0, 0.0): Limits(1.0, 2.0)}
     assert "elsewhere.json: is not kept: Permission denied" in capsys.readouterr().err
     assert not (run / "elsewhere.json").exists()
 
