@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from sdfhub.errors import SdfhubError
 from sdfhub.report.results import Scores, read_scores, read_sweep
-from sdfhub.tasks.names import flat
+from sdfhub.settings import flat
 from sdfhub.tasks.search import objective
 from sdfhub.whole_file import write_whole
 

@@ -34,7 +34,9 @@ def planned(method: str, normals: str = "on", seed: int = 0, sweep: str = "table
 
 def score(id: str, cd: float | None, floor: float = 0.05e-3, penalty: float = 0.4) -> dict:
     """A row of metrics.json; cd=None is a shape without a surface."""
-    return {"id": id, "cd": cd, "floor": floor, "cd_penalty": penalty, "failed": cd is None, "faces": 3}
+    normals = None if cd is None else 0.9
+    row = {"id": id, "cd": cd, "floor": floor, "cd_penalty": penalty, "failed": cd is None, "faces": 3}
+    return row | {"normal_consistency": normals}
 
 
 def write_cell(
@@ -46,6 +48,7 @@ def write_cell(
     parameters: int = 1000,
     ids: str = "chairs/{:04d}",
     made_with: dict[str, str] | None = None,
+    config: dict | None = None,
 ) -> Path:
     """Enters a cell into the plan and writes what a finished training of it leaves behind."""
     enter_cells(sweep, [cell])
@@ -60,11 +63,11 @@ def write_cell(
     metrics = {"training": training | ({"made_with": made_with} if made_with else {})}
     metrics |= {role: {"summary": {}, "shapes": rows} for role, rows in shapes.items() if rows}
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    config = {
+    written = {
         "data": {"loader": {"shapes_per_step": 20, "samples_per_shape": 256}},
         "trainer": {"max_epochs": 90},
     }
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "config.yaml").write_text(yaml.safe_dump(written | (config or {})))
     split = {role: [row["id"] for row in rows] for role, rows in shapes.items()}
     (folder / "split.json").write_text(json.dumps({"train": split["known"], "held_out": split["held_out"]}))
     return folder

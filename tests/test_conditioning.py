@@ -6,7 +6,7 @@ import torch
 from sdfhub.model.decoder import Layer
 from sdfhub.model.film import Film
 from sdfhub.model.fitting import field_and_jacobian
-from sdfhub.tasks.names import flat
+from sdfhub.settings import flat
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed, parameters
 from tests.test_model import ACTIVATIONS, small_decoder

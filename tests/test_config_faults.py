@@ -12,8 +12,8 @@ from lightning.pytorch import Trainer
 from benchmarks.overrides import Started, answer, keys_and_groups, random_override, shelf, started
 from sdfhub.data import store as stores
 from sdfhub.errors import SdfhubError
+from sdfhub.settings import flat
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.names import flat
 from tests.test_config import composed
 
 CONFIG = composed("data.shapes=4", "data.source.count=20")

@@ -39,7 +39,7 @@ def page_of(sweep, name="sweep"):
     """The page of a sweep whose true shapes are not on this machine."""
     cells = read_sweep(sweep)
     origin = origin_table(read_plan(sweep).commands, cells)
-    return page(name, cells, group_cells(cells), origin, Gallery(lambda id: None), 2)
+    return page(name, cells, group_cells(cells), origin, Gallery(lambda cell, id: None), 2)
 
 
 @pytest.fixture
@@ -59,19 +59,20 @@ def test_a_table_equals_what_is_computed_by_hand(small):
     group = only_group(small)
     known, beside, held_out, cost = tables(group)
     half = 12.7062 * math.sqrt(0.02) / math.sqrt(2)
-    assert known.rows[0][:7] == [
+    assert known.rows[0][:8] == [
         "DeepSDF",
         f"0.5000 ± {half:.4f}",
         f"0.5000 ± {half:.4f}",
         "0.0500",
         f"0.4500 ± {half:.4f}",
         f"0.4500 ± {half:.4f}",
+        "0.900",
         "0/6",
     ]
     assert known.rows[1][0] == "FFT/SIREN + normals"
     assert known.rows[1][1] == "0.2000", "both seeds have the same mean: no interval to print"
     assert known.rows[1][2] == f"0.1500 ± {half / 2:.4f}"
-    assert known.rows[1][8:] == [f"{0.15 / 0.45:.3g}", f"{0.10 / 0.45:.3g}"], "excess over DeepSDF's"
+    assert known.rows[1][9:] == [f"{0.15 / 0.45:.3g}", f"{0.10 / 0.45:.3g}"], "excess over DeepSDF's"
     assert known.best == {(1, 1), (1, 2), (1, 4), (1, 5)}
     assert beside.rows[1][1:5] == ["0.2000", "0.1284", "0.4", f"{0.1284 / 0.2076:.3g}"]
     assert beside.rows[1][7:] == ["0.3", f"{0.0508 / 0.0432:.3g}"]
@@ -101,7 +102,7 @@ def test_a_shape_without_a_surface_counts_with_its_penalty_and_is_counted(tmp_pa
     group = only_group(tmp_path / "s")
     assert group.rows[0].estimate("cd_mean").mean == pytest.approx((0.1e-3 + 0.4 + 0.3e-3) / 3)
     assert group.rows[0].estimate("excess_median").mean == pytest.approx(0.25e-3)
-    assert tables(group)[0].rows[0][6] == "1/3"
+    assert tables(group)[0].rows[0][6:8] == ["0.900", "1/3"], "normals of the two that have a surface"
 
 
 def test_failed_missing_and_broken_cells_are_told_in_a_line_each(small):
@@ -119,7 +120,7 @@ def test_failed_missing_and_broken_cells_are_told_in_a_line_each(small):
         ["SIREN + normals, seed 1", "failed", "metrics.json: cannot be read (JSONDecodeError)"],
         ["FFT/HOSC + normals, seed 0", "missing", "has not been run"],
     ]
-    states = {row[0]: row[7] for row in tables(group)[0].rows}
+    states = {row[0]: row[8] for row in tables(group)[0].rows}
     assert (states["SIREN + normals"], states["FFT/HOSC + normals"]) == ("failed", "missing")
     html = page_of(small)
     assert "loss is not finite at step 7" in html and "has not been run" in html
@@ -266,7 +267,7 @@ def test_rows_of_one_method_are_told_apart_and_common_settings_stand_in_the_titl
     labels = [row.label for row in group.rows]
     assert labels == ["FFT/HOSC + normals (activation.beta=1)", "FFT/HOSC + normals (activation.beta=2)"]
     assert group.title.endswith("1 shapes")
-    assert tables(group)[0].notes[-1] == "All rows with trainer.max_epochs=3."
+    assert tables(group)[0].notes[-1] == "All rows with decoder=small, trainer.max_epochs=3."
     for beta in ("1.2345678901", "12345678"):
         write_cell(
             sweep, planned("FFT/HOSC", **{"activation.beta": beta, "trainer.max_epochs": "3"}), [0.1e-3]
@@ -441,3 +442,91 @@ def test_a_verdict_that_one_clear_comparison_settles_is_no_noise(tmp_path):
             write_cell(tmp_path, planned(method, normals, seed), [cd + shift])
     (found,) = [one for one in verdicts(only_group(tmp_path)) if text in one.claim.text][:1]
     assert (found.state, found.within_noise) == ("does not hold", False)
+
+
+def test_seeds_trained_under_other_defaults_are_rows_of_their_own(tmp_path):
+    """A new version's defaults change a cell that the same command line asks for."""
+    for seed, tau in ((0, 0.088), (1, 0.0126), (2, 0.0126)):
+        config = {"seed": seed, "normals": {"tau": tau}, "loss": {"tau": tau}, "output_root": f"o{seed}"}
+        write_cell(tmp_path, planned("FFT/SIREN", seed=seed), [1e-3 * (seed + 1)], config=config)
+    enter_cells(tmp_path, [planned("FFT/SIREN", seed=3)])
+    group = only_group(tmp_path)
+    assert [(row.detail, len(row.done), len(row.cells)) for row in group.rows] == [
+        ("loss.tau=0.088", 1, 1),
+        ("loss.tau=0.0126", 2, 3),
+    ]
+    assert group.rows[1].estimate("cd_mean").mean == pytest.approx(2.5e-3)
+
+
+def test_other_shapes_and_other_ways_of_judging_are_other_groups_with_names_of_their_own(tmp_path):
+    for settings in ({"data.shapes": "8"}, {"data.shapes": "20"}, {"evaluate.resolution": "64"}):
+        write_cell(tmp_path, planned("SIREN", **settings), [0.1e-3])
+    write_cell(tmp_path, planned("SIREN", **{"data.loader.samples_per_shape": "9"}), [0.1e-3])
+    groups = group_cells(read_sweep(tmp_path))
+    assert [group.title for group in groups] == [
+        "chairs, data=procedural, scale=cpu, data.shapes=8, 1 shapes",
+        "chairs, data=procedural, scale=cpu, data.shapes=20, 1 shapes",
+        "chairs, data=procedural, scale=cpu, evaluate.resolution=64, 1 shapes",
+        "chairs, data=procedural, scale=cpu, 1 shapes",
+    ]
+    write_report(tmp_path, tmp_path / "report")
+    assert len(list((tmp_path / "report").glob("sheet_*.png"))) == 4
+    fits = [
+        planned("SIREN").model_copy(
+            update={"choices": planned("SIREN").choices | {"fit": fit}, "folder": fit}
+        )
+        for fit in ("deepsdf", "gauss_newton")
+    ]
+    for cell in fits:
+        write_cell(tmp_path / "fits", cell, [0.1e-3], [0.2e-3])
+    assert len(group_cells(read_sweep(tmp_path / "fits"))) == 2
+
+
+def test_what_all_rows_share_is_told(tmp_path):
+    for method in ("SIREN", "FFT/SIREN"):
+        cell = planned(method)
+        choices = cell.choices | {"conditioning": "film", "fit": "deepsdf"}
+        write_cell(tmp_path, cell.model_copy(update={"choices": choices}), [0.1e-3])
+    assert "All rows with conditioning=film, decoder=small." in tables(only_group(tmp_path))[0].notes
+
+
+def test_a_verdict_of_one_seed_says_so_and_parameters_need_no_seeds(tmp_path):
+    for method, cd, parameters in (
+        ("DeepSDF", 0.5e-3, 4000),
+        ("FFT/SIREN", 0.2e-3, 9),
+        ("FFT/HOSC", 0.1e-3, 9),
+    ):
+        normals = "off" if method == "DeepSDF" else "on"
+        write_cell(tmp_path, planned(method, normals), [cd], parameters=parameters)
+    found = {one.claim.text: one for one in verdicts(only_group(tmp_path))}
+    assert found["Less than a third of DeepSDF's parameters"].told == "holds"
+    assert found["Less than a third of DeepSDF's training time"].told == "does not hold (one seed)"
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert surpasses.told == "holds (one seed)"
+    assert "on 1 shapes, the paper's table on 100" in surpasses.figures
+    lowest = found["FFT/HOSC has the lowest mean CD of the small table"]
+    assert lowest.told == "not tested", "SIREN is not there"
+
+
+def test_a_difference_below_the_noise_of_sampling_decides_nothing(tmp_path):
+    for method, cd in (
+        ("DeepSDF", 0.3e-3),
+        ("SIREN", 0.2e-3),
+        ("FFT/SIREN", 0.1e-3),
+        ("FFT/HOSC", 0.0995e-3),
+    ):
+        write_cell(tmp_path, planned(method, "off" if method == "DeepSDF" else "on"), [cd])
+    found = {one.claim.text: one for one in verdicts(only_group(tmp_path))}
+    lowest = found["FFT/HOSC has the lowest mean CD of the small table"]
+    assert lowest.state == "not tested" and any("noise of sampling" in figure for figure in lowest.figures)
+
+
+def test_truth_is_looked_up_where_the_cell_was_trained(tmp_path):
+    """Two sources may give two shapes one id."""
+    folders = [write_cell(tmp_path, planned(method), [0.1e-3]) for method in ("SIREN", "FFT/SIREN")]
+    asked = []
+    gallery = Gallery(lambda cell, id: asked.append((cell.folder, id)))
+    group = only_group(tmp_path)
+    gallery.sheet(group, 1)
+    gallery.extremes(group)
+    assert {folder for folder, _ in asked} == set(folders)

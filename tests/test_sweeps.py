@@ -16,13 +16,13 @@ from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import PlannedCell
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import group_cells
+from sdfhub.settings import flat, settings_digest
 from sdfhub.tasks import train as train_task
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
 from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.cells import finished
 from sdfhub.tasks.evaluate import build_evaluation
-from sdfhub.tasks.names import flat, settings_digest
 from sdfhub.tasks.run import build_autodecoder
 from sdfhub.tasks.sweep import as_planned, jobs
 from tests.sweep_folders import score

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from sdfhub.report.paper import CLAIMS, Below, Claim
+from sdfhub.report.paper import CLAIMS, TRAINED_ON, Below, Claim
 from sdfhub.report.results import NOISE
 from sdfhub.report.rows import THOUSANDFOLD, Estimate, Group, duration
 
@@ -17,17 +17,24 @@ class Verdict:
         state: `not tested` where a figure that could decide it is missing.
         figures: the figures behind the verdict, or what is missing, one comparison each.
         within_noise: confidence intervals over seeds overlap in comparisons without which the verdict falls.
+        one_seed: a comparison without which the verdict falls has a side of one seed, whose noise is unknown.
     """
 
     claim: Claim
     state: Literal["holds", "does not hold", "not tested"]
     figures: list[str]
     within_noise: bool = False
+    one_seed: bool = False
+
+    @property
+    def doubt(self) -> str:
+        """What the verdict may owe to chance; empty where seeds bear it out, or nothing was tested."""
+        return "within seed noise" if self.within_noise else "one seed" if self.one_seed else ""
 
     @property
     def told(self) -> str:
         """The verdict in words, with its doubt."""
-        return self.state + (" (within seed noise)" if self.within_noise else "")
+        return f"{self.state} ({self.doubt})" if self.doubt else self.state
 
 
 def verdicts(group: Group) -> list[Verdict]:
@@ -44,7 +51,8 @@ def _verdict(claim: Claim, group: Group) -> Verdict:
     if claim.sweep and claim.sweep != sweep:
         return Verdict(claim, "not tested", [f"tested by sweeps={claim.sweep}"])
     outcomes = [_compared(below, group) for below in claim.rule]
-    known = [holds if not (claim.apart and overlap) else False for holds, overlap, _ in outcomes]
+    # True, False, or None where it cannot be said
+    known = [False if claim.apart and overlap and holds else holds for holds, overlap, _ in outcomes]
     if claim.needs == "all":
         state = False if False in known else None if None in known else True
     else:
@@ -53,12 +61,25 @@ def _verdict(claim: Claim, group: Group) -> Verdict:
     decisive = [overlap for (_, overlap, _), one in zip(outcomes, known, strict=True) if one is state]
     # one comparison alone decides that not all hold, or that any does: then only if none is clear it is noise
     told = any if (claim.needs == "all") is state else all
-    noise = state is not None and not claim.apart and bool(decisive) and told(decisive)
-    return Verdict(claim, words, list(dict.fromkeys(text for *_, text in outcomes)), noise)
+    noise = state is not None and not claim.apart and bool(decisive) and told(o is True for o in decisive)
+    unclear = (None,) if claim.apart else (None, True)
+    unknown = state is not None and bool(decisive) and told(o in unclear for o in decisive)
+    figures = list(dict.fromkeys(text for *_, text in outcomes))
+    return Verdict(claim, words, figures + _other_size(claim, group), noise, unknown and not noise)
 
 
-def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
-    """Whether the comparison holds (None: cannot be said), if intervals overlap, the figures in words."""
+def _other_size(claim: Claim, group: Group) -> list[str]:
+    """That the paper's table, which the claim is about, has another number of shapes."""
+    trained_on = {cell.scores.trained_on for row in group.rows for cell in row.done}
+    papers = TRAINED_ON.get(claim.sweep)
+    if papers is None or not trained_on or trained_on == {papers}:
+        return []
+    ours = " to ".join(map(str, dict.fromkeys((min(trained_on), max(trained_on)))))
+    return [f"on {ours} shapes, the paper's table on {papers}"]
+
+
+def _compared(below: Below, group: Group) -> tuple[bool | None, bool | None, str]:
+    """Whether the comparison holds, if intervals overlap (None: cannot be said), the figures in words."""
     sides = []
     for name in (below.left, below.right):
         row = group.row(*name)
@@ -78,13 +99,15 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, bool, str]:
     sign = "<" if holds else "not <"
     what = below.quantity.replace("_", " ") + (" of held-out shapes" if below.role == "held_out" else "")
     text = f"{what}: {left} {_told(a, below.quantity)} {sign} {limit}{right} {_told(b, below.quantity)}"
-    overlap = _overlap(a, b, below.factor)
+    if below.quantity in THOUSANDFOLD and abs(a.mean - below.factor * b.mean) < NOISE:
+        return None, False, f"{text} (by less than the noise of sampling)"
+    overlap = False if below.quantity == "parameters" else _overlap(a, b, below.factor)
     return holds, overlap, text + (" (intervals overlap)" if overlap else "")
 
 
-def _overlap(a: Estimate, b: Estimate, factor: float) -> bool:
+def _overlap(a: Estimate, b: Estimate, factor: float) -> bool | None:
     if a.half_width is None or b.half_width is None:
-        return False
+        return None
     return abs(a.mean - factor * b.mean) < a.half_width + factor * b.half_width
 
 

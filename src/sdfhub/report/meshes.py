@@ -12,8 +12,8 @@ from sdfhub.data.shards import StoredShape
 from sdfhub.report.results import Cell, ShapeScore
 from sdfhub.shapes import RADIUS
 
-FindTruth = Callable[[str], StoredShape | None]
-"""The prepared shape of an id; None where it does not lie on this machine."""
+FindTruth = Callable[[Cell, str], StoredShape | None]
+"""The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Gallery:
     """Renders and packs meshes, each once.
 
     Args:
-        find_truth: prepared shapes by id.
+        find_truth: prepared shapes by cell and id.
     """
 
     find_truth: FindTruth
@@ -58,7 +58,8 @@ class Gallery:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
         columns = [f"{id} ({'known' if role == 'known' else 'held out'})" for role, id in shown]
-        truth = [Tile(self._truth_image(id), "", "no truth") for _, id in shown]
+        first = _first_done(group)
+        truth = [Tile(self._truth_image(first, id), "", "no truth") for _, id in shown]
         rows = [("Ground truth", truth)] if any(tile.image is not None for tile in truth) else []
         for row in group.rows:
             absent = Tile(
@@ -96,7 +97,7 @@ class Gallery:
         triangles = min(MOST, max(FEWEST, triangles))
         found = []
         for role, id in shown:
-            meshes = [("Ground truth", true_mesh(self.find_truth(id)))]
+            meshes = [("Ground truth", true_mesh(self.find_truth(rows[0].done[0], id)))]
             meshes += [(row.label, self._mesh(row, role, id)) for row in rows]
             panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes if mesh]
             if panels:
@@ -104,7 +105,7 @@ class Gallery:
         return found
 
     def _pair(self, row: Row, shape: ShapeScore) -> list[Tile]:
-        truth = Tile(self._truth_image(shape.id), shape.id, "no truth")
+        truth = Tile(self._truth_image(row, shape.id), shape.id, "no truth")
         return [truth, self._tile(row, "known", shape.id)]
 
     def _tile(self, row: Row, role: str, id: str) -> Tile:
@@ -117,14 +118,16 @@ class Gallery:
         caption = "no surface" if score.failed else f"CD {score.counted_cd * 1e3:.3f}"
         return Tile(self._images[key], caption, "no surface" if score.failed else "no mesh")
 
-    def _truth_image(self, id: str) -> np.ndarray | None:
-        if ("truth", id) not in self._images:
-            self._images["truth", id] = picture(true_mesh(self.find_truth(id)))
-        return self._images["truth", id]
+    def _truth_image(self, row: Row, id: str) -> np.ndarray | None:
+        truth = self.find_truth(row.done[0], id)
+        key = truth and ("truth", truth.folder)
+        if key not in self._images:
+            self._images[key] = picture(true_mesh(truth))
+        return self._images[key]
 
     def _mesh(self, row: Row, role: str, id: str) -> Mesh | None:
         score = _score(row, role, id)
-        return reconstruction(row.done[0], role, score, self.find_truth(id)) if score else None
+        return reconstruction(row.done[0], role, score, self.find_truth(row.done[0], id)) if score else None
 
 
 def _score(row: Row, role: str, id: str) -> ShapeScore | None:
@@ -132,9 +135,13 @@ def _score(row: Row, role: str, id: str) -> ShapeScore | None:
     return next((score for score in row.done[0].scores.shapes.get(role, []) if score.id == id), None)
 
 
+def _first_done(group: Group) -> Row | None:
+    return next((row for row in group.rows if row.done), None)
+
+
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     """Role and id of the shapes to show: known ones, and up to a third held out, from the front of each."""
-    row = next((row for row in group.rows if row.done), None)
+    row = _first_done(group)
     if row is None:
         return []
     known, unseen = ([shape.id for shape in row.done[0].scores.shapes.get(role, [])] for role in ROLES)

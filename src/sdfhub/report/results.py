@@ -28,13 +28,14 @@ Name = Annotated[str, StringConstraints(max_length=200)]
 
 
 class ShapeScore(_Read):
-    """One judged shape: Chamfer distance, its noise floor, and what a failure counts as."""
+    """One judged shape: Chamfer distance, its noise floor, what a failure counts as, agreement of normals."""
 
     id: str = Field(max_length=300)
     cd: float | None
     floor: float
     cd_penalty: float
     failed: bool
+    normal_consistency: float | None = None
 
     @property
     def counted_cd(self) -> float:

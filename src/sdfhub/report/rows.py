@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from sdfhub.report.results import Cell
+from sdfhub.settings import OF_THE_SEED, deciding
 
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
 """The paper's names of encodings, and ours for those that it does not name."""
@@ -14,8 +15,11 @@ PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"
 ORDER = ("DeepSDF", "SIREN", "FFT/SIREN", "FFT/HOSC", "HASH/SIREN", "HASH/HOSC")
 """Rows of the paper's tables first, in its order."""
 
-OF_THE_GROUP = ("sweeps", "data", "category", "scale", "evaluate")
+OF_THE_GROUP = ("sweeps", "data", "category", "scale", "fit", "evaluate")
 """Choices under which numbers may be compared: rows that differ in one stand in different tables."""
+
+OF_THE_METHOD = ("experiment", "activation", "encoding", "normals", "trainer")
+"""Choices that a row's name tells, and one that changes no result."""
 
 THOUSANDFOLD = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
@@ -84,8 +88,9 @@ class Row:
 
         Args:
             quantity: `cd_mean`, `cd_median`, `excess_mean`, `excess_median` (normalised units squared, shapes
-                without a surface counted with their penalty), `floor_mean`, `no_surface` (shapes), `seconds`,
-                `parameters`, `steps`, `epochs`, `samples` or `trained_on`.
+                without a surface counted with their penalty), `normals_mean` (|cos| between normals, shapes
+                with a surface), `floor_mean`, `no_surface` (shapes), `seconds`, `parameters`, `steps`,
+                `epochs`, `samples` or `trained_on`.
             role: `known` or `held_out`; costs do not depend on it.
         """
         values = [_value(cell, quantity, role) for cell in self.done]
@@ -105,22 +110,26 @@ def _value(cell: Cell, quantity: str, role: str) -> float | None:
     if quantity == "no_surface":
         return sum(shape.failed for shape in shapes)
     what, statistic = quantity.rsplit("_", 1)
-    field = {"cd": "counted_cd", "excess": "excess", "floor": "floor"}[what]
-    values = [getattr(shape, field) for shape in shapes]
+    field = {"cd": "counted_cd", "normals": "normal_consistency"}.get(what, what)
+    values = [value for shape in shapes if (value := getattr(shape, field)) is not None]
+    if not values:
+        return None
     return float({"mean": np.mean, "median": np.median}[statistic](values))
 
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that may be compared: the same sweep, data, category, scale and way of judging.
+    """Rows that may be compared: the same sweep, shapes, scale and way of judging.
 
     Args:
         choices: what they share of OF_THE_GROUP.
-        settings: values on the command line that all of them share.
+        said: settings of the command line that decide which shapes are judged, and how.
+        settings: choices and values on the command line that all of them share beside.
         rows: in the order of the paper, then of the command.
     """
 
     choices: dict[str, str]
+    said: dict[str, str]
     settings: dict[str, str]
     rows: list[Row]
 
@@ -132,6 +141,7 @@ class Group:
             [f"{' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))} shapes"] if shapes else []
         )
         named = [f"{name}={self.choices[name]}" for name in ("data", "scale") if name in self.choices]
+        named += [f"{key}={value}" for key, value in self.said.items()]
         return ", ".join([self.choices.get("category", "all"), *named, *counted])
 
     def row(self, method: str, normals: str) -> Row | None:
@@ -153,12 +163,24 @@ def group_cells(cells: list[Cell]) -> list[Group]:
     """The cells of a sweep as groups of rows."""
     by_group: dict[tuple, list[Cell]] = {}
     for cell in cells:
-        by_group.setdefault(tuple(cell.plan.choices.get(name) for name in OF_THE_GROUP), []).append(cell)
+        choices = tuple(cell.plan.choices.get(name) for name in OF_THE_GROUP)
+        by_group.setdefault((choices, tuple(_of_the_group(cell).items())), []).append(cell)
     return [_group(members) for members in by_group.values()]
 
 
+def _of_the_group(cell: Cell) -> dict[str, str]:
+    """Settings of the command line that decide which shapes are judged, and how."""
+    return {
+        key: value
+        for key, value in sorted(cell.plan.settings.items())
+        if key.startswith(("data.", "evaluate.")) and not key.startswith("data.loader.")
+    }
+
+
 def _group(cells: list[Cell]) -> Group:
+    said = _of_the_group(cells[0])
     common = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
+    shared = set.intersection(*(set(cell.plan.choices.items()) for cell in cells))
     by_row: dict[tuple, list[Cell]] = {}
     for cell in cells:
         own = tuple(sorted(set(cell.plan.settings.items()) - common))
@@ -166,12 +188,46 @@ def _group(cells: list[Cell]) -> Group:
         by_row.setdefault((own, others), []).append(cell)
     names = {key: (_method(dict(key[1])), dict(key[1]).get("normals", "?")) for key in by_row}
     rows = [
-        Row(*names[key], _detail(key, [k for k in by_row if names[k] == names[key]]), members)
+        Row(*names[key], ", ".join(filter(None, [told, differing])), seeds)
         for key, members in by_row.items()
+        for told in [_detail(key, [k for k in by_row if names[k] == names[key]])]
+        for differing, seeds in _alike(members)
     ]
     rows.sort(key=lambda row: (_rank(row.method), row.normals != "on"))
-    first = cells[0].plan.choices
-    return Group({name: first[name] for name in OF_THE_GROUP if name in first}, dict(sorted(common)), rows)
+    choices = {name: cells[0].plan.choices[name] for name in OF_THE_GROUP if name in cells[0].plan.choices}
+    beside = {name: choice for name, choice in shared if name not in (*OF_THE_GROUP, *OF_THE_METHOD)}
+    return Group(choices, said, dict(sorted(beside.items())) | dict(sorted(common - set(said.items()))), rows)
+
+
+def _alike(cells: list[Cell]) -> list[tuple[str, list[Cell]]]:
+    """Seeds of one command line, apart where they were trained under different settings.
+
+    Defaults change between two versions, and the command line does not tell it. What has no scores yet goes
+    with the last.
+
+    Returns:
+        The settings that tell them apart, in words, and the cells.
+    """
+    found: list[tuple[dict, list[Cell]]] = []
+    for cell in cells:
+        if cell.scores:
+            settings = {k: v for k, v in deciding(cell.scores.config).items() if k not in OF_THE_SEED}
+            members = next((members for one, members in found if one == settings), None)
+            if members is None:
+                found.append((settings, members := []))
+            members.append(cell)
+    if len(found) < 2:
+        return [("", cells)]
+    found[-1][1].extend(cell for cell in cells if not cell.scores)
+    by_values: dict[tuple, str] = {}
+    for key in sorted({key for one, _ in found for key in one}):
+        values = tuple(_shortened(str(one.get(key, "unset"))) for one, _ in found)
+        if len(set(values)) > 1:
+            by_values.setdefault(values, key)  # interpolated into other places it is told once
+    return [
+        (", ".join(f"{key}={values[k]}" for values, key in by_values.items()), members)
+        for k, (_, members) in enumerate(found)
+    ]
 
 
 def _method(choices: dict[str, str]) -> str:

@@ -44,17 +44,19 @@ def tables(group: Group) -> list[Table]:
 
 
 def _scores(group: Group, role: str) -> Table:
-    head = ["method", "CD mean", "CD median", "floor", "excess mean", "excess median", "no surface", "seeds"]
+    head = ["method", "CD mean", "CD median", "floor", "excess mean", "excess median"]
+    head += ["normals", "no surface", "seeds"]
     rivals = ["excess mean / DeepSDF", "excess median / DeepSDF"] if group.deepsdf else []
     rows = []
     for row in group.rows:
         cells = [_thousandth(row.estimate(quantity, role)) for quantity in QUANTITIES]
-        cells += [_no_surface(row, role), _seeds(row)]
+        cells += [_told(row.estimate("normals_mean", role), 3), _no_surface(row, role), _seeds(row)]
         cells += [_ratio(group, row, q, role) for q in ("excess_mean", "excess_median") if rivals]
         rows.append([row.label, *cells])
     notes = [
         "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
-        "samplings of the truth. Shapes without a surface count with the CD of a single point. "
+        "samplings of the truth. Shapes without a surface count with the CD of a single point. Normals: mean "
+        "|cos| between those of the reconstruction and of the truth, of shapes with a surface. "
         "± is a 95% confidence interval over seeds (Student's t)."
     ]
     if group.settings:
@@ -119,6 +121,7 @@ def _costs(group: Group) -> Table:
             share = paper["seconds"] / COSTS["DeepSDF", "off"]["seconds"]
             printed = [f"{paper['parameters']:,.0f}", f"{paper['seconds'] / 3600:.0f} h", f"{share:.3g}"]
         time = NONE if seconds is None else duration(seconds.mean)
+        time += f" ± {duration(seconds.half_width)}" if seconds and seconds.half_width else ""
         rows.append([row.label, *counts, time, _ratio(group, row, "seconds"), *printed])
     notes = [
         "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
@@ -148,11 +151,14 @@ def claims_table(group: Group) -> Table:
 
 def _thousandth(value: Estimate | None) -> str:
     """A Chamfer distance times 10^3, four digits below 10 and fewer above, with its interval."""
+    return _told(value, 4 if value and abs(value.mean) < 0.01 else 2, 1e3)
+
+
+def _told(value: Estimate | None, places: int, factor: float = 1.0) -> str:
     if value is None:
         return NONE
-    mean, half = value.mean * 1e3, (value.half_width or 0) * 1e3
-    places = 4 if abs(mean) < 10 else 2
-    return f"{mean:.{places}f}" + (f" ± {half:.{places}f}" if half else "")
+    half = f" ± {value.half_width * factor:.{places}f}" if value.half_width else ""
+    return f"{value.mean * factor:.{places}f}{half}"
 
 
 def _count(value: Estimate | None) -> str:

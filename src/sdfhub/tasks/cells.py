@@ -14,9 +14,9 @@ from omegaconf import DictConfig
 
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
+from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import plain
-from sdfhub.tasks.names import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
 TASKS = ("SLURM_PROCID", "RANK")

@@ -1,23 +1,14 @@
 """Names of folders: of a run, of a sweep, and of a sweep's cell, which are found again by name."""
 
-import hashlib
-import json
 import os
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
+
 NAMED_CHOICES = ("data", "category", "experiment", "activation", "encoding", "normals", "decoder", "scale")
-
-WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
-WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
-WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile")
-WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
-WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
-WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes")
-"""Settings that say where and how watched a cell runs; its result is the same under any of them."""
-
 
 OF_A_ROW = ("activation", "encoding", "normals", "decoder", "conditioning", "optim", "codes", "loss", "scale")
 """Parts of a config that the rows of a table differ in."""
@@ -77,24 +68,6 @@ def _digest_of(root: DictConfig, leave: tuple[str, ...] = ()) -> str:
     if leave:
         kept["overrides"] = sorted(word for word in said if not word.startswith(WHERE_NOT_WHAT))
     return settings_digest(kept)
-
-
-def settings_digest(config: dict[str, Any]) -> str:
-    """10 hex digits that change with every setting that can change a run's result.
-
-    Args:
-        config: plain, as `config.yaml` of a run holds it.
-    """
-    kept = {key: value for key, value in flat(config).items() if not key.startswith(WHERE_NOT_WHAT)}
-    return hashlib.sha256(json.dumps(kept, sort_keys=True, default=str).encode()).hexdigest()[:10]
-
-
-def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by dotted key; a list counts as one setting."""
-    found: dict[str, Any] = {}
-    for key, value in node.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return found
 
 
 def _joined(choices: Any) -> str:

@@ -1,6 +1,6 @@
 """Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
 
-from functools import cache
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
 from sdfhub.report.pictures import Gallery, Sheet
 from sdfhub.report.plan import read_plan
-from sdfhub.report.results import read_sweep
+from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import Group, group_cells
 from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks.app import first_word_as, run_task
@@ -45,36 +45,40 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims, origin])}")
     write_whole(out / "table.tex", latex(all_tables))
     write_whole(out / "table.csv", csv_text(groups))
-    gallery = Gallery(truth_finder(groups))
+    gallery = Gallery(truth_finder())
     for group in groups:
-        write_sheet(gallery.sheet(group, shapes), out / f"{'_'.join(['sheet', *group.choices.values()])}.png")
+        write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
     write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
     print(f"report: {out / 'report.html'}", flush=True)
+
+
+def sheet_name(group: Group) -> str:
+    """A name of its own for each group of a sweep."""
+    said = [f"{key}-{value}" for key, value in group.said.items()]
+    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *group.choices.values(), *said]))[:200]
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
     rows = [[tile.alt if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
-    if rows:
+    if rows and sheet.columns:
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
 
 
-def truth_finder(groups: list[Group]) -> FindTruth:
-    """Finds prepared shapes in the stores that the cells were trained from, as far as they are here."""
-    configs = [cell.scores.config for group in groups for row in group.rows for cell in row.done]
-    stores = {id(config): _store(config) for config in _one_per_store(configs)}
+def truth_finder() -> FindTruth:
+    """Finds prepared shapes in the store that a cell was trained from, where that is here."""
+    stores: dict[str, Store | None] = {}
 
-    @cache
-    def find(id: str) -> StoredShape | None:
-        return next((store[id] for store in stores.values() if store and id in store), None)
+    def find(cell: Cell, id: str) -> StoredShape | None:
+        data = cell.scores.config["data"]
+        key = str([data.get(name) for name in ("source", "preparation", "store")])
+        if key not in stores:
+            stores[key] = _store(cell.scores.config)
+        store = stores[key]
+        return store[id] if store and id in store else None
 
     return find
-
-
-def _one_per_store(configs: list[dict]) -> list[dict]:
-    keys = ("source", "preparation", "store")
-    return list({str([config["data"].get(key) for key in keys]): config for config in configs}.values())
 
 
 def _store(config: dict[str, Any]) -> Store | None:

@@ -20,6 +20,7 @@ from torch import Tensor
 from sdfhub.data.batches import Loading
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
+from sdfhub.settings import WHERE_NOT_WHAT, flat
 from sdfhub.shapes import Frame
 from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
@@ -29,7 +30,6 @@ from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
-from sdfhub.tasks.names import WHERE_NOT_WHAT, flat
 from sdfhub.tasks.prepare import prepare_data
 from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
