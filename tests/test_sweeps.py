@@ -211,6 +211,35 @@ def test_a_failing_cell_stops_no_other_and_is_tried_again(trainer, tmp_path, cap
     assert [cell.state for cell in read_sweep(sweep)] == ["done"] * 2
 
 
+def test_a_failure_written_after_the_scores_is_forgotten_when_they_are_found(trainer, tmp_path):
+    assert status() == 0
+    sweep = tmp_path / "outputs" / "sweeps" / "smoke"
+    (read_sweep(sweep)[0].folder / "failed.json").write_text(json.dumps({"reason": "the disk was full"}))
+    assert [cell.state for cell in read_sweep(sweep)] == ["failed", "done"]
+    trainer.calls = []
+    assert status() == 0 and trainer.calls == []
+    assert [cell.state for cell in read_sweep(sweep)] == ["done", "done"]
+
+
+def test_failed_cells_are_told_where_the_report_breaks(trainer, monkeypatch, capsys):
+    def broken(*arguments):
+        raise KeyError("a fault of the report's own")
+
+    monkeypatch.setattr("sdfhub.tasks.report.write_report", broken)
+    trainer.fail = ("Relu", 0)
+    assert status() == 1
+    told = capsys.readouterr().err
+    assert "1 of 2 cells failed" in told and "no report" in told and "Traceback" not in told
+
+
+@pytest.mark.parametrize("seeds", ["abc", "0,-1", "1.5"])
+def test_a_seed_that_is_none_is_refused_before_any_cell(seeds, trainer, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "sweeps=smoke", f"seed={seeds}"])
+    assert status() == 2
+    told = capsys.readouterr().err
+    assert "seed=" in told and "Traceback" not in told and trainer.calls == []
+
+
 def test_metrics_of_other_settings_or_half_a_file_do_not_count_as_finished(tmp_path):
     config = composed("seed=3")
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))

@@ -16,7 +16,7 @@ from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.tasks.app import one_line
-from sdfhub.tasks.build import plain
+from sdfhub.tasks.build import Seed, check, plain
 from sdfhub.whole_file import write_whole
 
 TASKS = ("SLURM_PROCID", "RANK")
@@ -78,10 +78,10 @@ def go_on(
         config: plain.
     """
     metrics = finished(folder, config)
+    (folder / FAILURE).unlink(missing_ok=True)
     if metrics is not None:
         print(f"run: {folder}: finished before", flush=True)
         return metrics
-    (folder / FAILURE).unlink(missing_ok=True)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     if config["ckpt_path"] is None and checkpoint.is_file():
         print(f"run: {folder}: goes on from {checkpoint.name}", flush=True)
@@ -101,7 +101,12 @@ def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
-    """A composed cell as `sweep.json` keeps it."""
+    """A composed cell as `sweep.json` keeps it.
+
+    Raises:
+        SdfhubError: a seed that is none.
+    """
+    seed = check(config.seed, Seed, "seed")
     groups = {name: choice for name, choice in hydra.runtime.choices.items() if "/" not in name}
     said = (override.lstrip("+~").partition("=") for override in hydra.overrides.task)
     return PlannedCell(
@@ -114,7 +119,7 @@ def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedC
             for key, _, value in said
             if (key not in groups or key == "tuned") and key != "seed" and not key.startswith(WHERE_NOT_WHAT)
         },
-        seed=int(config.seed),
+        seed=seed,
     )
 
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
-from sdfhub.tasks.app import register_resolvers
+from sdfhub.tasks.app import one_line, register_resolvers
 from sdfhub.tasks.cells import planned_cell
 
 EXTRAS = {"submitit": "slurm", "joblib": "joblib", "optuna": "optuna"}
@@ -48,6 +48,9 @@ class SweepRecord(Callback):
             hold_search(Path(config.hydra.sweep.dir))
         try:
             self._planned = planned_cells(config)
+        except SdfhubError as error:
+            print(f"sdfhub: error: {error}", file=sys.stderr)
+            sys.exit(2)
         except Exception as error:  # the sweeper composes the same, and tells it better
             print(f"sdfhub: the sweep cannot be planned: {error}", file=sys.stderr)
             return
@@ -62,8 +65,8 @@ class SweepRecord(Callback):
         sweep = Path(config.hydra.sweep.dir)
         try:
             write_report(sweep, sweep / "report")
-        except SdfhubError as error:
-            print(f"sdfhub: error: {error}", file=sys.stderr)
+        except Exception as error:  # whatever it is, the cells' own failures are told
+            print(f"sdfhub: error: no report: {one_line(error)}; sdfhub report {sweep}", file=sys.stderr)
         cells = self._planned or read_plan(sweep).cells
         failed = [cell for cell in cells if (sweep / cell.folder / FAILURE).exists()]
         if failed:
