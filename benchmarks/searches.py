@@ -9,19 +9,21 @@
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. A file
 that --csv wrote stands for the searches in it; of two searches of one name the later one counts. The
 objective is what a search lowers: the geometric mean of mean and median excess CD of known and of held-out
-shapes. Beside it both means and medians; all times 10^3. Settings are those in which trainings differ.
+shapes. Beside it both means and medians; all times 10^3. Settings are those that the search drew.
 """
 
 import argparse
 import csv
 import io
 import json
+import shlex
 import warnings
 from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
 
 from sdfhub.errors import SdfhubError
+from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Scores, read_scores, read_sweep
 from sdfhub.settings import flat
 from sdfhub.tasks.search import objective
@@ -60,7 +62,10 @@ def read_search(folder: Path) -> list[Trial]:
         raise SdfhubError(f"{folder}: not a search; `sdfhub report` tells what a sweep found")
     said = [cell.plan.settings for cell in cells]
     everywhere = sorted(set.intersection(*map(set, said))) if said else []
-    searched = [key for key in everywhere if len({settings[key] for settings in said}) > 1]
+    fixed = {
+        word.partition("=")[0] for command in read_plan(folder).commands for word in shlex.split(command)
+    }
+    searched = [key for key in everywhere if key not in fixed]
     found = [
         Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})
         for cell in cells

@@ -210,6 +210,15 @@ def test_the_best_trials_of_one_search_come_first_in_another(search, tmp_path):
     assert search.rates == best[1:]
 
 
+def test_the_settings_of_a_search_of_one_trial_are_those_that_it_drew(search):
+    from benchmarks.searches import read_search
+
+    assert search.start("search.trials=1", "trainer.precision=bf16-mixed") == 0, "one trial, nothing differs"
+    (trial,) = read_search(search.folders()[0])
+    assert set(trial.settings) > {"optim.lr_codes", "optim.lr_decoder"}
+    assert "trainer.precision" not in trial.settings
+
+
 def test_a_table_of_trials_that_is_none_is_refused_by_name(tmp_path):
     from benchmarks.searches import read_csv
 
