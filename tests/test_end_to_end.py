@@ -286,6 +286,21 @@ def ball_batches():
     return batches(shapes=4, per_step=4, samples=256, surface=64)
 
 
+def fit(module: L.LightningModule, batches, steps: int, callback: L.Callback, **settings) -> None:
+    trainer = L.Trainer(
+        accelerator="cpu",
+        max_epochs=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        callbacks=[callback],
+        **settings,
+    )
+    trainer.fit(module, torch.utils.data.DataLoader(batches, sampler=range(steps), batch_size=None))
+
+
 @pytest.mark.parametrize(("activation", "encoding", "normals"), COMBINATIONS)
 def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
     choices = [f"activation={activation}", f"encoding={encoding}", f"normals={normals}"]
@@ -298,21 +313,38 @@ def test_every_combination_lowers_its_loss_from_its_defaults(activation, encodin
         def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
             losses.append(float(outputs["loss"]))
 
-    trainer = L.Trainer(
-        accelerator="cpu",
-        max_epochs=1,
-        limit_train_batches=60,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-        callbacks=[Keep()],
-    )
-    steps = torch.utils.data.DataLoader(ball_batches, sampler=range(60), batch_size=None)
-    trainer.fit(module, steps)
+    fit(module, ball_batches, 60, Keep())
     assert all(torch.isfinite(torch.tensor(losses)))
     assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+@pytest.mark.parametrize(("algorithm", "order"), [("norm", 2), ("value", float("inf"))])
+def test_gradients_are_clipped_under_either_precision(algorithm, order, precision, ball_batches):
+    sizes = []
+
+    class Keep(L.Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            gradients = [p.grad for p in module.parameters()]
+            sizes.append(float(torch.nn.utils.get_total_norm(gradients, order)))
+
+    settings = {"precision": precision, "gradient_clip_algorithm": algorithm}
+    for limit in (None, 1e-3):
+        module = build_autodecoder(composed("~tuned"), rows=4, steps=3)
+        fit(module, ball_batches, 3, Keep(), gradient_clip_val=limit, **settings)
+    assert min(sizes[:3]) > 2e-3 and max(sizes[3:]) <= 1.001e-3
+
+
+def test_a_full_memory_of_the_gpu_is_one_line(tmp_path, monkeypatch):
+    from sdfhub.tasks import train as task
+
+    def full(*arguments, **named):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(L.pytorch.Trainer, "fit", full)
+    shapes = ["data.shapes=1", "data.held_out=0", f"data.store={tmp_path / 'store'}", "callbacks=none"]
+    with pytest.raises(SdfhubError, match=r"lower computing\.points_at_once"):
+        task.train(composed(*TINY, *shapes), tmp_path / "run")
 
 
 def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path):

@@ -11,10 +11,11 @@ import torch.nn.functional as F
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
 from sdfhub.errors import SdfhubError
+from sdfhub.model import computing
 from sdfhub.model.activations import Hosc, Relu, Siren, joined
 from sdfhub.model.computing import Computing
 from sdfhub.model.dropout import kept
-from sdfhub.model.encodings import Fourier
+from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
 from sdfhub.model.pieces import loss_in_pieces, pieces
 from sdfhub.shapes import Batch
 from tests.test_model import ACTIVATIONS as CHOICES
@@ -334,16 +335,91 @@ def test_computing_takes_what_suits_the_device():
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
     assert Computing().together(cpu) < Computing().together(gpu)
     assert Computing(points_at_once=5).together(gpu) == 5
-    assert Computing().compiled(function, cpu) is function
-    assert Computing(compile=False).compiled(function, gpu) is function
-    assert Computing(compile=True).compiled(function, cpu) is not function
+    assert Computing().compiled(function, device=cpu) == (function,)
+    assert Computing(compile=False).compiled(function, device=gpu) == (function,)
+    assert Computing(compile=True).compiled(function, device=cpu) != (function,)
     with pytest.raises(ValueError, match="at least 1"):
         Computing(points_at_once=0)
     try:
         Computing(matmul="medium").set_up(cpu)
         assert torch.get_float32_matmul_precision() == "medium"
     finally:
-        torch.set_float32_matmul_precision("highest")
+        Computing.put_back()
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_on_a_gpu_without_compilers_nothing_is_compiled(monkeypatch):
+    gpu = torch.device("cuda")
+    monkeypatch.setattr(computing.shutil, "which", lambda name: "/usr/bin/cc")
+    monkeypatch.setattr(computing, "find_spec", lambda name: None if name == "triton" else object())
+    assert Computing().compiled(len, device=gpu) == (len,)
+    monkeypatch.setattr(computing, "find_spec", lambda name: object())
+    assert Computing().compiled(len, device=gpu) != (len,)
+    monkeypatch.setattr(computing.shutil, "which", lambda name: None)
+    assert Computing().compiled(len, device=gpu) == (len,)
+
+
+def test_what_does_not_compile_runs_as_it_is_unless_it_was_asked_for(monkeypatch):
+    called = []
+
+    def refuse(function):
+        def broken(*arguments):
+            called.append(arguments)
+            raise RuntimeError("PTXAS: no such architecture\nand much more")
+
+        return broken
+
+    monkeypatch.setattr(torch, "compile", refuse)
+    monkeypatch.setattr(computing, "can_compile", lambda device: True)
+    (length,) = Computing().compiled(len, device=torch.device("cuda"))
+    with pytest.warns(UserWarning, match="goes on without, RuntimeError: PTXAS: no such architecture$"):
+        assert length("abc") == 3
+    assert length("ab") == 2 and called == [("abc",)], "it is not tried again"
+    with pytest.raises(TypeError, match="has no len"):
+        length(3)
+    (asked,) = Computing(compile=True).compiled(len, device=torch.device("cuda"))
+    with pytest.raises(RuntimeError, match="PTXAS"):
+        asked("abc")
+
+
+def test_pieces_are_differentiated_outside_of_autocast_as_a_whole_batch_is():
+    weight = torch.nn.Parameter(torch.randn(4, 3))
+    seen = []
+
+    def parts_of(piece):
+        product = piece.points @ weight.T
+        product.register_hook(lambda _: seen.append(torch.is_autocast_enabled("cpu")))
+        return {"sdf": product.float().square().mean()}
+
+    batch = Batch(
+        torch.arange(2), torch.rand(2, 8, 3), torch.rand(2, 8), torch.zeros(2, 0, 3), torch.zeros(2, 0, 3)
+    )
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss_in_pieces(parts_of, batch, 4, [weight])
+    assert seen == [False] * 4
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [Identity(), Fourier(3), Gaussian(6, 1.0), Hash(2, 2, 8, 4, 8)],
+    ids=lambda one: type(one).__name__,
+)
+def test_under_bfloat16_every_encoding_sees_places_in_float32(encoding):
+    decoder = small_decoder(CHOICES["siren"], encoding)
+    points, codes = torch.rand(2, 7, 3) - 0.5, torch.randn(2, 4)
+    seen = []
+    decoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        decoder(points, codes)
+        sdf, gradient = decoder.value_and_gradient(points, codes)
+    for encoded in seen:
+        torch.testing.assert_close(encoded, encoding(points), rtol=0, atol=0)
+    want = decoder.value_and_gradient(points, codes)
+    for one, other in zip((sdf, gradient), want, strict=True):
+        assert one.dtype == torch.float32
+        assert (one - other).norm() < 0.05 * other.norm()
+    (sdf.sum() + gradient.square().sum()).backward()
+    assert all(torch.isfinite(p.grad).all() for p in decoder.parameters())
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)

@@ -9,7 +9,7 @@ WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
 WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile")
 WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
 WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
-WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes")
+WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes", "scale.mesh_every")
 """Settings that say where and how watched a cell runs; its result is the same under any of them."""
 
 

@@ -56,8 +56,11 @@ class AutoDecoder(L.LightningModule):
 
     def on_fit_start(self) -> None:
         self.computing.set_up(self.device)
-        self._value = self.computing.compiled(self.decoder.forward, self.device)
-        self._value_and_gradient = self.computing.compiled(self.decoder.value_and_gradient, self.device)
+        passes = self.decoder.forward, self.decoder.value_and_gradient
+        self._value, self._value_and_gradient = self.computing.compiled(*passes, device=self.device)
+
+    def on_fit_end(self) -> None:
+        self.computing.put_back()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         torch.manual_seed((self.seed << 32) + self.global_step)
@@ -101,6 +104,16 @@ class AutoDecoder(L.LightningModule):
             self.decoder.parameters(), self.codes.parameters(), self.steps
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_gradient_clipping(
+        self, optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        # Lightning clips no gradients of a fused optimiser under mixed precision, for fear of a loss scale
+        if gradient_clip_val:
+            weights = [p for group in optimizer.param_groups for p in group["params"]]
+            by_value = gradient_clip_algorithm == "value"
+            clip = torch.nn.utils.clip_grad_value_ if by_value else torch.nn.utils.clip_grad_norm_
+            clip(weights, gradient_clip_val)
 
     def on_before_optimizer_step(self, optimizer) -> None:
         gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}

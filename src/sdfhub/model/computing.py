@@ -3,8 +3,10 @@
 import ctypes
 import os
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal
 
 import torch
@@ -23,7 +25,7 @@ class Computing:
     Args:
         points_at_once: samples that go through the decoder together, >= 1; bounds memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
-            None: on a GPU, where there is one.
+            None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
         matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
             (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
     """
@@ -45,12 +47,49 @@ class Computing:
         torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
         keep_freed_memory()
 
-    def compiled(self, function: Callable, device: torch.device) -> Callable:
-        """The function itself, or what `torch.compile` makes of it on this device."""
-        wanted = self.compile
-        if wanted is None:
-            wanted = device.type == "cuda" and shutil.which(os.environ.get("CC", "cc")) is not None
-        return torch.compile(function) if wanted else function
+    @staticmethod
+    def put_back() -> None:
+        """Products are exact again, as PyTorch begins: what is trained is judged with all its digits."""
+        torch.set_float32_matmul_precision("highest")
+
+    def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
+        """The functions themselves, or what `torch.compile` makes of them on this device.
+
+        What an earlier training of this process compiled is forgotten: there is room for few versions.
+        """
+        if not (can_compile(device) if self.compile is None else self.compile):
+            return functions
+        torch.compiler.reset()
+        fast = [torch.compile(function) for function in functions]
+        if self.compile:
+            return tuple(fast)
+        return tuple(plain_if_broken(*pair) for pair in zip(fast, functions, strict=True))
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether what `torch.compile` needs beside PyTorch for a GPU is there."""
+    tools = shutil.which(os.environ.get("CC", "cc")) and find_spec("triton")
+    return device.type == "cuda" and bool(tools)
+
+
+def plain_if_broken(fast: Callable, plain: Callable) -> Callable:
+    """Calls `fast`, and from its first failure on `plain`, whose failure is the caller's."""
+    broken = False
+
+    def call(*arguments):
+        nonlocal broken
+        if not broken:
+            try:
+                return fast(*arguments)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:
+                broken = True
+                reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+                warnings.warn(f"computing.compile: goes on without, {reason}", stacklevel=2)
+        return plain(*arguments)
+
+    return call
 
 
 def keep_freed_memory() -> None:

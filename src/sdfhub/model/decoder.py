@@ -141,7 +141,8 @@ class Decoder(nn.Module):
 
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
-        encoded = self.encoding(points)
+        with torch.autocast(points.device.type, enabled=False):  # a place deserves all its digits
+            encoded = self.encoding(points)
         inputs, dropout = encoded, self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
@@ -165,7 +166,8 @@ class Decoder(nn.Module):
             points: normalised frame.
             codes: [B, L].
         """
-        encoded, to_space = self.encoding.with_pullback(points)
+        with torch.autocast(points.device.type, enabled=False):
+            encoded, to_space = self.encoding.with_pullback(points)
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)

@@ -78,7 +78,8 @@ class _Summed(torch.autograd.Function):
         total, gradients = 0, None
         with torch.enable_grad():
             for loss in losses():
-                found = torch.autograd.grad(loss, parameters)
+                with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
+                    found = torch.autograd.grad(loss, parameters)
                 if gradients is None:
                     gradients = list(found)
                 else:

@@ -8,6 +8,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
@@ -107,7 +108,13 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     print(f"run: {run}", flush=True)
     trainer = parts.trainer
     with ending_together(trainer):
-        trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+        try:
+            trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+        except torch.OutOfMemoryError as error:
+            raise SdfhubError(
+                "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
+                "data.loader.resident=false leaves the samples on the disk"
+            ) from error
     if not trainer.is_global_zero:
         return {}
     training = parts.record.summary(model) | {"made_with": made_with(trainer)}
