@@ -340,15 +340,27 @@ def test_augmented_copies_are_drawn_from_and_not_shapes(tmp_path):
     assert (cell.scores.trained_on, cell.scores.samples) == (3, 50 * 9 * 256)
 
 
-def test_what_was_judged_by_distances_alone_says_so(tmp_path):
-    folder = write_cell(tmp_path, planned("SIREN"), [0.1e-3])
-    metrics = json.loads((folder / "metrics.json").read_text())
-    rows = [{"id": "a", "sdf_error": 0.1, "sign_accuracy": 1.0}]
-    metrics |= {"held_out": {"summary": {}, "shapes": rows}}
-    del metrics["known"]
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    (cell,) = read_sweep(tmp_path)
-    assert cell.state == "failed" and "signed distances alone" in cell.reason
+def test_what_was_judged_by_distances_alone_has_a_table_of_its_own(tmp_path):
+    for method, normals, errors in (("DeepSDF", "off", (0.2, 0.4)), ("SIREN", "on", (0.1, 0.1))):
+        folder = write_cell(tmp_path, planned(method, normals), [0.1e-3])
+        metrics = json.loads((folder / "metrics.json").read_text())
+        rows = [{"id": str(error), "sdf_error": error, "sign_accuracy": 1 - error} for error in errors]
+        metrics |= {"held_out": {"summary": {}, "shapes": rows}}
+        del metrics["known"]
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    group = only_group(tmp_path)
+    distances, cost = tables(group)
+    assert distances.title.startswith("Held-out shapes, signed distances")
+    assert distances.rows == [
+        ["DeepSDF", "300.00", "300.00", "0.7000", "1/1", "1"],
+        ["SIREN + normals", "100.00", "100.00", "0.9000", "1/1", "0.333"],
+    ]
+    assert cost.rows[0][1] == "1"
+    assert {one.state for one in verdicts(group)} == {"not tested"}
+    assert "no figure of: SIREN + normals" in str([one.figures for one in verdicts(group)])
+    assert "signs right" in page_of(tmp_path)
+    line = next(csv.DictReader(csv_text([group]).splitlines()))
+    assert (line["role"], line["cd_mean"]) == ("known", "")
 
 
 def test_a_lock_is_held_once_and_freed(tmp_path):

@@ -87,7 +87,8 @@ def _compared(below: Below, group: Group) -> tuple[bool | None, bool | None, str
         if value is None:
             of_method = group.rows_of(*name)
             shown = row.label if row else f"{name[0]}, normals {name[1]}"
-            return None, False, f"{'several rows' if len(of_method) > 1 else 'no such row'}: {shown}"
+            why = "several rows" if len(of_method) > 1 else "no figure of" if row else "no such row"
+            return None, False, f"{why}: {shown}"
         if below.quantity in THOUSANDFOLD and not row.has_surfaces(below.role):
             return None, False, f"no shape has a surface: {row.label}"
         sides.append((row.label, value))

@@ -85,6 +85,7 @@ def csv_text(groups: list[Group]) -> str:
     Chamfer distances in normalised units squared, not times 10^3; times in seconds.
     """
     quantities = (*THOUSANDFOLD, "floor_mean", "no_surface", "normals_mean")
+    quantities += ("sdf_error_mean", "sdf_error_median", "sign_accuracy_mean")
     costs = ("seconds", "parameters", "epochs", "steps", "samples", "trained_on")
     named: list[Callable] = [lambda e: e.mean, lambda e: e.half_width, lambda e: e.seeds]
     head = ["category", "data", "scale", "settings", "method", "normals", "detail", "role", "cells"]

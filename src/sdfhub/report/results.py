@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Generic, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
@@ -25,6 +25,8 @@ class _Read(BaseModel):
 
 
 Name = Annotated[str, StringConstraints(max_length=200)]
+
+Score = TypeVar("Score")
 
 
 class ShapeScore(_Read):
@@ -48,6 +50,14 @@ class ShapeScore(_Read):
         return self.counted_cd - self.floor
 
 
+class DistanceScore(_Read):
+    """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
+
+    id: str = Field(max_length=300)
+    sdf_error: float
+    sign_accuracy: float
+
+
 class Training(_Read):
     """The cost of a training, and versions and hardware by name, which old runs do not tell."""
 
@@ -57,14 +67,14 @@ class Training(_Read):
     made_with: dict[Name, Name] = {}
 
 
-class _Role(_Read):
-    shapes: list[ShapeScore]
+class _Role(_Read, Generic[Score]):
+    shapes: list[Score]
 
 
-class _Metrics(_Read):
+class _Metrics(_Read, Generic[Score]):
     training: Training | None
-    known: _Role | None = None
-    held_out: _Role | None = None
+    known: _Role[Score] | None = None
+    held_out: _Role[Score] | None = None
 
 
 class _Augmentation(_Read):
@@ -99,7 +109,8 @@ class Scores:
     """The scores and the cost of a finished cell.
 
     Args:
-        shapes: judged shapes by role.
+        shapes: shapes judged by their surfaces, by role.
+        distances: shapes of a source without meshes, by role.
         training: its cost.
         epochs: passes that the trainer was asked for.
         samples: signed samples drawn in all.
@@ -108,6 +119,7 @@ class Scores:
     """
 
     shapes: dict[str, list[ShapeScore]]
+    distances: dict[str, list[DistanceScore]]
     training: Training
     epochs: int | None
     samples: int
@@ -164,9 +176,9 @@ def read_scores(folder: Path) -> Scores:
         SdfhubError: a file is missing, broken or not what training writes.
     """
     content = _loaded(folder / "metrics.json")
-    if any("sdf_error" in json.dumps(content.get(role, {}))[:2000] for role in ROLES):
-        raise SdfhubError("judged by signed distances alone: its source holds no meshes")
-    metrics = _checked(_Metrics, content, "metrics.json")
+    by_distance = any("sdf_error" in json.dumps(content.get(role, {}))[:2000] for role in ROLES)
+    kind = DistanceScore if by_distance else ShapeScore
+    metrics = _checked(_Metrics[kind], content, "metrics.json")
     raw = _loaded(folder / "config.yaml")
     config = _checked(_Config, raw, "config.yaml")
     shapes = len(_checked(_Split, _loaded(folder / "split.json"), "split.json").train)
@@ -176,7 +188,8 @@ def read_scores(folder: Path) -> Scores:
     rows = shapes * (1 + loader.augmentation.copies)
     drawn = metrics.training.steps * min(loader.shapes_per_step, rows) * loader.samples_per_shape
     roles = {role: getattr(metrics, role).shapes for role in ROLES if getattr(metrics, role)}
-    return Scores(roles, metrics.training, config.trainer.max_epochs, drawn, shapes, raw)
+    found = ({}, roles) if by_distance else (roles, {})
+    return Scores(*found, metrics.training, config.trainer.max_epochs, drawn, shapes, raw)
 
 
 def _failure(path: Path) -> str:

@@ -89,8 +89,9 @@ class Row:
         Args:
             quantity: `cd_mean`, `cd_median`, `excess_mean`, `excess_median` (normalised units squared, shapes
                 without a surface counted with their penalty), `normals_mean` (|cos| between normals, shapes
-                with a surface), `floor_mean`, `no_surface` (shapes), `seconds`, `parameters`, `steps`,
-                `epochs`, `samples` or `trained_on`.
+                with a surface), `floor_mean`, `no_surface` (shapes), `sdf_error_mean`, `sdf_error_median`,
+                `sign_accuracy_mean` (of sources without meshes), `seconds`, `parameters`, `steps`, `epochs`,
+                `samples` or `trained_on`.
             role: `known` or `held_out`; costs do not depend on it.
         """
         values = [_value(cell, quantity, role) for cell in self.done]
@@ -104,7 +105,8 @@ def _value(cell: Cell, quantity: str, role: str) -> float | None:
         return getattr(scores.training, quantity)
     if quantity in ("epochs", "samples", "trained_on"):
         return getattr(scores, quantity)
-    shapes = scores.shapes.get(role)
+    by_distance = quantity.startswith(("sdf_error", "sign_accuracy"))
+    shapes = (scores.distances if by_distance else scores.shapes).get(role)
     if not shapes:
         return None
     if quantity == "no_surface":

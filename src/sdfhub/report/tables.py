@@ -37,10 +37,19 @@ class Table:
 
 def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, known ones beside the paper, costs, and what is missing."""
-    roles = [role for role in ROLES if any(row.estimate("cd_mean", role) for row in group.rows)]
+    roles = _judged_by(group, "cd_mean")
     found = [_scores(group, role) for role in roles]
     beside = [_beside_paper(group)] if "known" in roles and not all(row.detail for row in group.rows) else []
-    return [*found[:1], *beside, *found[1:], _costs(group), *_missing(group)]
+    distances = [
+        _distances(group, role)
+        for role in ROLES
+        if any(r.estimate("sdf_error_mean", role) for r in group.rows)
+    ]
+    return [*found[:1], *beside, *found[1:], *distances, _costs(group), *_missing(group)]
+
+
+def _judged_by(group: Group, quantity: str) -> list[str]:
+    return [role for role in ROLES if any(row.estimate(quantity, role) for row in group.rows)]
 
 
 def _scores(group: Group, role: str) -> Table:
@@ -63,6 +72,21 @@ def _scores(group: Group, role: str) -> Table:
         notes.append(f"All rows with {', '.join(f'{key}={value}' for key, value in group.settings.items())}.")
     title = f"{TITLES[role]}: {group.title}"
     return Table(title, [*head, *rivals], rows, notes, _best(group, role))
+
+
+def _distances(group: Group, role: str) -> Table:
+    """Scores of a source without meshes, such as DeepSDF's npz files."""
+    head = ["method", "|f - d| mean", "|f - d| median", "signs right", "seeds", "mean / DeepSDF"]
+    rows = []
+    for row in group.rows:
+        errors = [_thousandth(row.estimate(f"sdf_error_{one}", role)) for one in ("mean", "median")]
+        signs = _told(row.estimate("sign_accuracy_mean", role), 4)
+        rows.append([row.label, *errors, signs, _seeds(row), _ratio(group, row, "sdf_error_mean", role)])
+    note = (
+        "The source holds no meshes, so that no Chamfer distance can be had. |f - d| times 10³: mean over a "
+        "shape's samples near its surface, then over shapes; signs right: share of samples."
+    )
+    return Table(f"{TITLES[role]}, signed distances: {group.title}", head, rows, [note])
 
 
 def _beside_paper(group: Group) -> Table:
