@@ -1,0 +1,71 @@
+"""Whether what is wrong about known shapes is their mirror image: of a symmetric family, some shapes are not.
+
+    python benchmarks/mirrors.py RUN ...
+
+Per run, shapes by their excess (times 10^3), and by how much their surface differs from its own mirror image
+across either vertical plane (CD times 10^3). Strays: samples of the reconstruction further than 0.05 from the
+true surface; beside their share, the share of them that lies within 0.05 of the mirrored truth, across the
+plane that explains more. Last the rank correlation of excess and asymmetry across each plane.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import spearmanr
+
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.metrics import sample_surface
+from sdfhub.report.meshes import reconstruction
+from sdfhub.report.plan import PlannedCell
+from sdfhub.report.results import Cell, ShapeScore, read_scores
+from sdfhub.tasks.report import truth_finder
+
+POINTS, FAR = 10_000, 0.05
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=Path)
+    truth = truth_finder()
+    for run in parser.parse_args().runs:
+        try:
+            plan = PlannedCell(folder=run.name, choices={}, settings={}, seed=0)
+            cell = Cell(plan, run, "done", "", read_scores(run))
+        except SdfhubError as error:
+            parser.error(f"{run}: {error}")
+        rows = [row for score in cell.scores.shapes["known"] if (row := judged(cell, score, truth))]
+        if not rows:
+            parser.error(f"{run}: the prepared shapes that it was trained on are not here")
+        rows.sort(key=lambda row: -row[1])
+        print(f"\n### {run.name}\n")
+        print("| shape | excess | differs across x | across the other | strays | of these mirrored |")
+        print("| --- | --- | --- | --- | --- | --- |")
+        for id, *numbers in rows:
+            excess, across, other, strays, mirrored = numbers
+            told = f"{mirrored:.2f}" if strays else ""
+            print(f"| {id} | {excess:.4f} | {across:.2f} | {other:.2f} | {strays:.3f} | {told} |")
+        columns = np.array([row[1:4] for row in rows]).T
+        ranks = [spearmanr(columns[0], column).statistic for column in columns[1:]]
+        print(f"\nrank correlation of excess: across x {ranks[0]:.2f}, across the other {ranks[1]:.2f}")
+
+
+def judged(cell: Cell, score: ShapeScore, truth) -> tuple | None:
+    """Id, excess, two asymmetries, strays, share of these in the mirror; None without truth or mesh."""
+    shape = truth(cell, score.id)
+    mesh = reconstruction(cell, "known", score, shape) if shape else None
+    if mesh is None:
+        return None
+    surface = np.array(shape.surface[:POINTS, :3])
+    tree = cKDTree(surface)
+    mirrors = [surface * np.where(np.arange(3) == axis, -1, 1) for axis in (0, 1 if shape.up == "z" else 2)]
+    asymmetries = [2e3 * (tree.query(mirror)[0] ** 2).mean() for mirror in mirrors]  # both ways alike
+    points, _ = sample_surface(mesh.vertices, mesh.faces, POINTS, seed=0)
+    strays = points[tree.query(points)[0] > FAR]
+    explained = [np.mean(cKDTree(m).query(strays)[0] < FAR) if len(strays) else 0.0 for m in mirrors]
+    return score.id, score.excess * 1e3, *asymmetries, len(strays) / len(points), max(explained)
+
+
+if __name__ == "__main__":
+    main()
