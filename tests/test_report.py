@@ -399,6 +399,12 @@ def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monk
     assert "DeepSDF" in capsys.readouterr().out
 
 
+def test_what_is_no_sweep_gets_no_folder(tmp_path):
+    with pytest.raises(SdfhubError, match="not the folder of a multirun"):
+        report_task.report({"sweep": str(tmp_path / "nothere"), "out": None, "shapes": 2})
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_is_no_sweep_is_one_line(tmp_path):
     with pytest.raises(SdfhubError, match="not the folder of a multirun"):
         write_report(tmp_path, tmp_path / "report")

@@ -102,6 +102,7 @@ def report(config: dict[str, Any]) -> None:
     if shapes < 1:
         raise SdfhubError(f"shapes={shapes}: must be at least 1")
     folder = Path(out) if out else sweep / "report"
+    read_plan(sweep)  # what is no sweep gets no folder
     refuse_unwritable(folder)
     write_report(sweep, folder, shapes)
 
