@@ -266,8 +266,8 @@ def test_rows_of_one_method_are_told_apart_and_common_settings_stand_in_the_titl
     group = only_group(sweep)
     labels = [row.label for row in group.rows]
     assert labels == ["FFT/HOSC + normals (activation.beta=1)", "FFT/HOSC + normals (activation.beta=2)"]
-    assert group.title.endswith("1 shapes")
-    assert tables(group)[0].notes[-1] == "All rows with decoder=small, trainer.max_epochs=3."
+    assert group.title.endswith("trained on 1")
+    assert tables(group)[0].notes[-1] == "All rows with trainer.max_epochs=3."
     for beta in ("1.2345678901", "12345678"):
         write_cell(
             sweep, planned("FFT/HOSC", **{"activation.beta": beta, "trainer.max_epochs": "3"}), [0.1e-3]
@@ -482,10 +482,10 @@ def test_other_shapes_and_other_ways_of_judging_are_other_groups_with_names_of_t
     write_cell(tmp_path, planned("SIREN", **{"data.loader.samples_per_shape": "9"}), [0.1e-3])
     groups = group_cells(read_sweep(tmp_path))
     assert [group.title for group in groups] == [
-        "chairs, data=procedural, scale=cpu, data.shapes=8, 1 shapes",
-        "chairs, data=procedural, scale=cpu, data.shapes=20, 1 shapes",
-        "chairs, data=procedural, scale=cpu, evaluate.resolution=64, 1 shapes",
-        "chairs, data=procedural, scale=cpu, 1 shapes",
+        "chairs, data=procedural, scale=cpu, data.shapes=8, trained on 1",
+        "chairs, data=procedural, scale=cpu, data.shapes=20, trained on 1",
+        "chairs, data=procedural, scale=cpu, evaluate.resolution=64, trained on 1",
+        "chairs, data=procedural, scale=cpu, trained on 1",
     ]
     write_report(tmp_path, tmp_path / "report")
     assert len(list((tmp_path / "report").glob("sheet_*.png"))) == 4
@@ -500,12 +500,20 @@ def test_other_shapes_and_other_ways_of_judging_are_other_groups_with_names_of_t
     assert len(group_cells(read_sweep(tmp_path / "fits"))) == 2
 
 
-def test_what_all_rows_share_is_told(tmp_path):
-    for method in ("SIREN", "FFT/SIREN"):
-        cell = planned(method)
-        choices = cell.choices | {"conditioning": "film", "fit": "deepsdf"}
-        write_cell(tmp_path, cell.model_copy(update={"choices": choices}), [0.1e-3])
-    assert "All rows with conditioning=film, decoder=small." in tables(only_group(tmp_path))[0].notes
+def test_each_row_is_measured_by_the_deepsdf_of_its_own_settings(tmp_path):
+    for epochs, own, rival in (("5", 0.3e-3, 0.55e-3), ("9", 0.2e-3, 0.65e-3)):
+        write_cell(tmp_path, planned("SIREN", **{"trainer.max_epochs": epochs}), [own])
+        write_cell(tmp_path, planned("DeepSDF", "off", **{"trainer.max_epochs": epochs}), [rival])
+    rows = {row[0]: row[-1] for row in tables(only_group(tmp_path))[0].rows}
+    assert rows["SIREN + normals (trainer.max_epochs=5)"] == "0.5"
+    assert rows["SIREN + normals (trainer.max_epochs=9)"] == "0.25"
+
+
+def test_rows_of_the_csv_say_which_shapes_they_are_judged_by(tmp_path):
+    for split in "01":
+        write_cell(tmp_path, planned("SIREN", **{"data.split_seed": split}), [0.1e-3])
+    lines = csv.DictReader(csv_text(group_cells(read_sweep(tmp_path))).splitlines())
+    assert {line["settings"] for line in lines} == {"data.split_seed=0", "data.split_seed=1"}
 
 
 def test_a_verdict_of_one_seed_says_so_and_parameters_need_no_seeds(tmp_path):

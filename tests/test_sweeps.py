@@ -196,6 +196,17 @@ def test_an_interrupted_sweep_goes_on_with_what_is_missing_and_repeats_nothing(t
     assert "| DeepSDF |" in capsys.readouterr().out
 
 
+def test_groups_that_no_name_tells_are_settings_where_they_are_said(trainer, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "sweeps=smoke", "seed=0", "conditioning=concat,film"])
+    assert status() == 0
+    (group,) = group_cells(read_sweep(tmp_path / "outputs" / "sweeps" / "smoke"))
+    assert [row.label for row in group.rows] == [
+        f"{method} (conditioning={choice})"
+        for method in ("DeepSDF", "FFT/SIREN + normals")
+        for choice in ("concat", "film")
+    ]
+
+
 def test_a_failing_cell_stops_no_other_and_is_tried_again(trainer, tmp_path, capsys):
     sweep = tmp_path / "outputs" / "sweeps" / "smoke"
     trainer.fail = ("Relu", 0)
@@ -240,15 +251,18 @@ def test_a_seed_that_is_none_is_refused_before_any_cell(seeds, trainer, monkeypa
     assert "seed=" in told and "Traceback" not in told and trainer.calls == []
 
 
-def test_metrics_of_other_settings_or_half_a_file_do_not_count_as_finished(tmp_path):
+def test_metrics_of_other_settings_or_broken_ones_do_not_count_as_finished(tmp_path):
     config = composed("seed=3")
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["a"]}))
     assert finished(tmp_path, config) is None
-    (tmp_path / "metrics.json").write_text('{"known": 1}')
-    assert finished(tmp_path, config) == {"known": 1}
+    whole = {"training": {"seconds": 1.0, "steps": 5, "parameters": 9}}
+    (tmp_path / "metrics.json").write_text(json.dumps(whole))
+    assert finished(tmp_path, config) == whole
     assert finished(tmp_path, config | {"seed": 4}) is None
-    (tmp_path / "metrics.json").write_text('{"known": ')
-    assert finished(tmp_path, config) is None
+    for broken in ('{"known": ', "{}", "[1, 2]", '{"training": {"seconds": "x"}}'):
+        (tmp_path / "metrics.json").write_text(broken)
+        assert finished(tmp_path, config) is None, broken
 
 
 def test_a_sweep_without_multirun_says_what_to_add(trainer, monkeypatch, capsys):

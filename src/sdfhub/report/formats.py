@@ -94,7 +94,7 @@ def csv_text(groups: list[Group]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*head, *costs])
     for group in groups:
-        said = ";".join(f"{key}={value}" for key, value in group.settings.items())
+        said = ";".join(f"{key}={value}" for key, value in (group.said | group.settings).items())
         place = [*(group.choices.get(name, "") for name in ("category", "data", "scale")), said]
         for row in group.rows:
             for role in ROLES:

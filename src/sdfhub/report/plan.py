@@ -62,9 +62,10 @@ def read_plan(sweep: Path) -> Plan:
     try:
         return Plan.model_validate_json((sweep / PLAN).read_bytes())
     except OSError as error:
+        one_run = "; it is that of one run" if (sweep / "metrics.json").exists() else ""
         raise SdfhubError(
             f"{sweep}: not the folder of a multirun, such as outputs/sweeps/table_small "
-            f"({PLAN}: {(error.strerror or 'unreadable').lower()})"
+            f"({PLAN}: {(error.strerror or 'unreadable').lower()}){one_run}"
         ) from error
     except ValidationError as error:
         first = error.errors()[0]

@@ -18,9 +18,6 @@ ORDER = ("DeepSDF", "SIREN", "FFT/SIREN", "FFT/HOSC", "HASH/SIREN", "HASH/HOSC")
 OF_THE_GROUP = ("sweeps", "data", "category", "scale", "fit", "evaluate")
 """Choices under which numbers may be compared: rows that differ in one stand in different tables."""
 
-OF_THE_METHOD = ("experiment", "activation", "encoding", "normals", "trainer")
-"""Choices that a row's name tells, and one that changes no result."""
-
 THOUSANDFOLD = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
 
@@ -126,7 +123,7 @@ class Group:
     Args:
         choices: what they share of OF_THE_GROUP.
         said: settings of the command line that decide which shapes are judged, and how.
-        settings: choices and values on the command line that all of them share beside.
+        settings: values on the command line that all of them share beside.
         rows: in the order of the paper, then of the command.
     """
 
@@ -137,10 +134,10 @@ class Group:
 
     @cached_property
     def title(self) -> str:
-        """`chairs, data=open, scale=cpu, 20 shapes`; settings of all rows stand below a table."""
+        """`chairs, data=open, scale=cpu, trained on 20`; settings of all rows stand below a table."""
         shapes = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
         counted = (
-            [f"{' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))} shapes"] if shapes else []
+            [f"trained on {' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))}"] if shapes else []
         )
         named = [f"{name}={self.choices[name]}" for name in ("data", "scale") if name in self.choices]
         named += [f"{key}={value}" for key, value in self.said.items()]
@@ -155,10 +152,11 @@ class Group:
         """The rows of that method; several where they differ in a setting."""
         return [row for row in self.rows if (row.method, row.normals) == (method, normals)]
 
-    @property
-    def deepsdf(self) -> Row | None:
-        """The rival all others are measured by: DeepSDF as published."""
-        return self.row("DeepSDF", "off")
+    def rival(self, row: Row) -> Row | None:
+        """The row of DeepSDF as published that a row is measured by: under its own settings, or the only one."""
+        rivals = self.rows_of("DeepSDF", "off")
+        alike = [rival for rival in rivals if rival.detail == row.detail]
+        return alike[0] if len(alike) == 1 else rivals[0] if len(rivals) == 1 else None
 
 
 def group_cells(cells: list[Cell]) -> list[Group]:
@@ -182,7 +180,6 @@ def _of_the_group(cell: Cell) -> dict[str, str]:
 def _group(cells: list[Cell]) -> Group:
     said = _of_the_group(cells[0])
     common = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
-    shared = set.intersection(*(set(cell.plan.choices.items()) for cell in cells))
     by_row: dict[tuple, list[Cell]] = {}
     for cell in cells:
         own = tuple(sorted(set(cell.plan.settings.items()) - common))
@@ -197,8 +194,7 @@ def _group(cells: list[Cell]) -> Group:
     ]
     rows.sort(key=lambda row: (_rank(row.method), row.normals != "on"))
     choices = {name: cells[0].plan.choices[name] for name in OF_THE_GROUP if name in cells[0].plan.choices}
-    beside = {name: choice for name, choice in shared if name not in (*OF_THE_GROUP, *OF_THE_METHOD)}
-    return Group(choices, said, dict(sorted(beside.items())) | dict(sorted(common - set(said.items()))), rows)
+    return Group(choices, said, dict(sorted(common - set(said.items()))), rows)
 
 
 def _alike(cells: list[Cell]) -> list[tuple[str, list[Cell]]]:
@@ -251,7 +247,7 @@ def _detail(key: tuple, namesakes: list[tuple]) -> str:
     """Settings of the row's own, and choices only where rows of its name differ in them."""
     own, others = key
     common = set.intersection(*(set(k[1]) for k in namesakes))
-    told = [*own, *(pair for pair in others if pair not in common)]
+    told = dict.fromkeys([*own, *(pair for pair in others if pair not in common)])
     return ", ".join(f"{name}={_shortened(value)}" for name, value in told)
 
 

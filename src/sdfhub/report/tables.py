@@ -55,7 +55,7 @@ def _judged_by(group: Group, quantity: str) -> list[str]:
 def _scores(group: Group, role: str) -> Table:
     head = ["method", "CD mean", "CD median", "floor", "excess mean", "excess median"]
     head += ["normals", "no surface", "seeds"]
-    rivals = ["excess mean / DeepSDF", "excess median / DeepSDF"] if group.deepsdf else []
+    rivals = [f"excess {one} / DeepSDF" for one in ("mean", "median") if group.rows_of("DeepSDF", "off")]
     rows = []
     for row in group.rows:
         cells = [_thousandth(row.estimate(quantity, role)) for quantity in QUANTITIES]
@@ -66,7 +66,7 @@ def _scores(group: Group, role: str) -> Table:
         "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
         "samplings of the truth. Shapes without a surface count with the CD of a single point. Normals: mean "
         "|cos| between those of the reconstruction and of the truth, of shapes with a surface. "
-        "± is a 95% confidence interval over seeds (Student's t)."
+        "± is a 95% confidence interval over seeds (Student's t); bold the lowest mean, however near others are."
     ]
     if group.settings:
         notes.append(f"All rows with {', '.join(f'{key}={value}' for key, value in group.settings.items())}.")
@@ -113,7 +113,8 @@ def _beside_paper(group: Group) -> Table:
 
 def _ratio(group: Group, row: Row, quantity: str, role: str = "known") -> str:
     """The row's value over DeepSDF's; none where that says nothing (an excess at or below 0)."""
-    rival = group.deepsdf.estimate(quantity, role) if group.deepsdf else None
+    measured_by = group.rival(row)
+    rival = measured_by.estimate(quantity, role) if measured_by else None
     own = row.estimate(quantity, role)
     return f"{own.mean / rival.mean:.3g}" if own and rival and min(own.mean, rival.mean) > 0 else NONE
 

@@ -9,11 +9,12 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig
 
+from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
+from sdfhub.report.results import read_scores
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import Seed, check, plain
@@ -24,6 +25,9 @@ TASKS = ("SLURM_PROCID", "RANK")
 
 UNTOLD_GROUPS = ("callbacks", "tuned")
 """Groups that say how watched a cell is, or follow from the others unless they are said."""
+
+TOLD_IF_SAID = ("tuned", "conditioning", "decoder", "loss", "optim")
+"""Groups that no name of a row tells: said on the command line they count as settings."""
 
 
 def run_cell(
@@ -90,14 +94,16 @@ def go_on(
 
 
 def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
-    """The metrics of a cell that was trained and judged under these very settings; None where it was not."""
+    """The metrics of a cell that was trained and judged under these very settings; None where it was not.
+
+    What a report could not read is not finished.
+    """
     try:
+        then = read_scores(folder).config
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        then = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-        same = settings_digest(then) == settings_digest(config)
-    except (OSError, ValueError, yaml.YAMLError, AttributeError):
+    except (OSError, SdfhubError):
         return None
-    return metrics if same and isinstance(metrics, dict) else None
+    return metrics if settings_digest(then) == settings_digest(config) else None
 
 
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
@@ -117,7 +123,9 @@ def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedC
         settings={
             key: value
             for key, _, value in said
-            if (key not in groups or key == "tuned") and key != "seed" and not key.startswith(WHERE_NOT_WHAT)
+            if (key not in groups or key in TOLD_IF_SAID)
+            and key != "seed"
+            and not key.startswith(WHERE_NOT_WHAT)
         },
         seed=seed,
     )

@@ -1,6 +1,7 @@
 """Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,10 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
         write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
     write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
     print(f"report: {out / 'report.html'}", flush=True)
+    failed = sum(cell.state == "failed" for cell in cells)
+    if failed:
+        again = "the command of the sweep tries them again"
+        print(f"sdfhub: {failed} of {len(cells)} cells failed; {again}", file=sys.stderr)
 
 
 def sheet_name(group: Group) -> str:
