@@ -66,7 +66,7 @@ def _scores(group: Group, role: str) -> Table:
         "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
         "samplings of the truth. Shapes without a surface count with the CD of a single point. Normals: mean "
         "|cos| between those of the reconstruction and of the truth, of shapes with a surface. "
-        "± is a 95% confidence interval over seeds (Student's t); bold the lowest mean, however near others are."
+        "± is a 95% confidence interval over seeds (Student's t); bold: the lowest, however near others are."
     ]
     if group.settings:
         notes.append(f"All rows with {', '.join(f'{key}={value}' for key, value in group.settings.items())}.")
