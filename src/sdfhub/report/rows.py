@@ -153,7 +153,7 @@ class Group:
         return [row for row in self.rows if (row.method, row.normals) == (method, normals)]
 
     def rival(self, row: Row) -> Row | None:
-        """The row of DeepSDF as published that a row is measured by: of the same settings, or the only one."""
+        """The row of DeepSDF as published that a row is measured by: of equal settings, or the only one."""
         rivals = self.rows_of("DeepSDF", "off")
         alike = [rival for rival in rivals if rival.detail == row.detail]
         return alike[0] if len(alike) == 1 else rivals[0] if len(rivals) == 1 else None
