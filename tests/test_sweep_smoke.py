@@ -66,7 +66,7 @@ def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
     html = (sweep / "report" / "report.html").read_text()
     assert html.count("data:image/webp") >= 3 * 3 and len(html) < 10_000_000
     assert "<polyline" in html and "<circle" in html
-    assert (sweep / "report" / "sheet_smoke_procedural_chairs_demo_fast.png").is_file()
+    assert (sweep / "report" / "sheet_smoke_procedural_chairs_demo_gauss_newton_fast.png").is_file()
     origin = (sweep / "report" / "table.md").read_text().partition("### How it was made")[2]
     assert "python train.py -m sweeps=smoke" in origin and "4 of them with | python 3." in origin
     for name in ("table.md", "table.tex", "table.csv"):

@@ -1,6 +1,7 @@
 """The decoder f_theta(x, z): an MLP from encoded points and a shape's code to a signed distance."""
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +13,13 @@ from sdfhub.model.encodings import Encoding
 
 HEAD_SPREAD = 0.03
 """Standard deviation of the initial output for hidden units of size 1: well inside the clamp delta = 0.1."""
+
+
+def full_precision(like: Tensor) -> AbstractContextManager:
+    """Keeps autocast, where there is any on the device of `like`, off what is computed inside."""
+    device = like.device.type
+    # a region without need is one that torch.export must write down, and it cannot write one inside another
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 class Layer(nn.Module):
@@ -44,11 +52,11 @@ class Layer(nn.Module):
         from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
         shift = self.linear.bias
         if self.columns[2]:
-            with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
+            with full_precision(codes):  # one error here moves a whole shape
                 shift = F.linear(codes, from_code, self.linear.bias)[:, None]
         if self.columns[0]:
             return F.linear(inputs, from_points), shift
-        with torch.autocast(inputs.device.type, enabled=False):  # a place deserves all its digits too
+        with full_precision(inputs):  # a place deserves all its digits too
             return F.linear(inputs, from_points), shift
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -141,7 +149,7 @@ class Decoder(nn.Module):
 
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
-        with torch.autocast(points.device.type, enabled=False):  # a place deserves all its digits
+        with full_precision(points):  # a place deserves all its digits
             encoded = self.encoding(points)
         inputs, dropout = encoded, self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
@@ -151,7 +159,7 @@ class Decoder(nn.Module):
         return self._head(inputs, encoded, codes)
 
     def _head(self, inputs: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
-        with torch.autocast(inputs.device.type, enabled=False):  # a distance deserves all its digits
+        with full_precision(inputs):  # a distance deserves all its digits
             product, shift = self.layers[-1](inputs.to(encoded.dtype), codes)
         sdf = (product + shift).squeeze(-1)
         return torch.tanh(sdf) if self.tanh else sdf
@@ -166,7 +174,7 @@ class Decoder(nn.Module):
             points: normalised frame.
             codes: [B, L].
         """
-        with torch.autocast(points.device.type, enabled=False):
+        with full_precision(points):
             encoded, to_space = self.encoding.with_pullback(points)
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
@@ -183,5 +191,5 @@ class Decoder(nn.Module):
             by_hidden, part = layer.pullback(cotangent, codes)
             by_encoding = by_encoding if part is None else by_encoding + part
             cotangent = None if slope is None else by_hidden * slope
-        with torch.autocast(points.device.type, enabled=False):
+        with full_precision(points):
             return sdf, to_space(by_encoding)

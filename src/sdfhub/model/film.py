@@ -1,9 +1,8 @@
 """Conditioning by scale and shift: the code enters no layer, it steers what the layer makes of a point."""
 
-import torch
 from torch import Tensor, nn
 
-from sdfhub.model.decoder import Layer
+from sdfhub.model.decoder import Layer, full_precision
 
 
 class Film(Layer):
@@ -41,6 +40,6 @@ class Film(Layer):
         return super().pullback(cotangent, codes)
 
     def _scale_and_shift(self, codes: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.autocast(codes.device.type, enabled=False):  # one error here moves a whole shape
+        with full_precision(codes):  # one error here moves a whole shape
             scale, shift = self.film(codes)[:, None].chunk(2, dim=-1)
             return 1 + scale, shift
