@@ -29,13 +29,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=Path)
     truth = truth_finder()
-    for run in parser.parse_args().runs:
+    for run in map(Path.resolve, parser.parse_args().runs):
         try:
             plan = PlannedCell(folder=run.name, choices={}, settings={}, seed=0)
             cell = Cell(plan, run, "done", "", read_scores(run))
         except SdfhubError as error:
             parser.error(f"{run}: {error}")
-        rows = [row for score in cell.scores.shapes["known"] if (row := judged(cell, score, truth))]
+        rows = [row for score in cell.scores.shapes.get("known", []) if (row := judged(cell, score, truth))]
         if not rows:
             parser.error(f"{run}: the prepared shapes that it was trained on are not here")
         rows.sort(key=lambda row: -row[1])

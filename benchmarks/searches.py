@@ -16,7 +16,7 @@ import argparse
 import csv
 import io
 import json
-import shlex
+import re
 import warnings
 from pathlib import Path
 from statistics import mean, median
@@ -28,6 +28,9 @@ from sdfhub.report.results import Scores, read_scores, read_sweep
 from sdfhub.settings import flat
 from sdfhub.tasks.search import objective
 from sdfhub.whole_file import write_whole
+
+KEYS = re.compile(r"(?:^|\s)['\"]?[+~]*([^\s='\"]+)")
+"""Keys of a command's words, quoted or not, whole or cut."""
 
 SCORES = ("objective", "known", "known_median", "held_out", "held_out_median", "seconds")
 
@@ -62,9 +65,7 @@ def read_search(folder: Path) -> list[Trial]:
         raise SdfhubError(f"{folder}: not a search; `sdfhub report` tells what a sweep found")
     said = [cell.plan.settings for cell in cells]
     everywhere = sorted(set.intersection(*map(set, said))) if said else []
-    fixed = {
-        word.partition("=")[0] for command in read_plan(folder).commands for word in shlex.split(command)
-    }
+    fixed = {key for command in read_plan(folder).commands for key in KEYS.findall(command)}
     searched = [key for key in everywhere if key not in fixed]
     found = [
         Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})

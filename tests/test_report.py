@@ -26,7 +26,7 @@ from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
 from sdfhub.report.tables import claims_table, tables
 from sdfhub.tasks import report as report_task
-from sdfhub.tasks.report import write_report
+from sdfhub.tasks.report import sheet_name, write_report
 from tests.sweep_folders import planned, score, write_cell, write_mesh
 
 
@@ -477,18 +477,20 @@ def test_seeds_trained_under_other_defaults_are_rows_of_their_own(tmp_path):
 
 
 def test_other_shapes_and_other_ways_of_judging_are_other_groups_with_names_of_their_own(tmp_path):
-    for settings in ({"data.shapes": "8"}, {"data.shapes": "20"}, {"evaluate.resolution": "64"}):
+    shapes = [{"data.shapes": "8"}, {"data.shapes": "20"}, {"scale.small_table": "9"}]
+    for settings in (*shapes, {"evaluate.resolution": "64"}):
         write_cell(tmp_path, planned("SIREN", **settings), [0.1e-3])
     write_cell(tmp_path, planned("SIREN", **{"data.loader.samples_per_shape": "9"}), [0.1e-3])
     groups = group_cells(read_sweep(tmp_path))
     assert [group.title for group in groups] == [
         "chairs, data=procedural, scale=cpu, data.shapes=8, trained on 1",
         "chairs, data=procedural, scale=cpu, data.shapes=20, trained on 1",
+        "chairs, data=procedural, scale=cpu, scale.small_table=9, trained on 1",
         "chairs, data=procedural, scale=cpu, evaluate.resolution=64, trained on 1",
         "chairs, data=procedural, scale=cpu, trained on 1",
     ]
     write_report(tmp_path, tmp_path / "report")
-    assert len(list((tmp_path / "report").glob("sheet_*.png"))) == 4
+    assert len(list((tmp_path / "report").glob("sheet_*.png"))) == 5
     fits = [
         planned("SIREN").model_copy(
             update={"choices": planned("SIREN").choices | {"fit": fit}, "folder": fit}
@@ -497,7 +499,29 @@ def test_other_shapes_and_other_ways_of_judging_are_other_groups_with_names_of_t
     ]
     for cell in fits:
         write_cell(tmp_path / "fits", cell, [0.1e-3], [0.2e-3])
-    assert len(group_cells(read_sweep(tmp_path / "fits"))) == 2
+    groups = group_cells(read_sweep(tmp_path / "fits"))
+    assert len(groups) == len({group.title for group in groups}) == len({sheet_name(g) for g in groups}) == 2
+    assert {line["fit"] for line in csv.DictReader(csv_text(groups).splitlines())} == {
+        "deepsdf",
+        "gauss_newton",
+    }
+
+
+def test_sheets_of_long_and_of_odd_settings_have_names_of_their_own(tmp_path):
+    roots = [f"/mnt/{'deep/' * 50}{name}" for name in ("a", "b")]
+    for key, values in {"data.source.root": roots, "data.source.names": ["[a,b]", "[a-b]"]}.items():
+        for k, value in enumerate(values):
+            cell = planned("SIREN").model_copy(update={"settings": {key: value}, "folder": f"{key}{k}"})
+            write_cell(tmp_path, cell, [0.1e-3])
+    names = {sheet_name(group) for group in group_cells(read_sweep(tmp_path))}
+    assert len(names) == 4 and all(len(name) < 200 for name in names)
+
+
+def test_a_default_that_is_said_later_leaves_a_row_its_name(tmp_path):
+    plain, said = planned("FFT/SIREN"), planned("FFT/SIREN", decoder="small")
+    enter_cells(tmp_path, [plain, planned("SIREN")])
+    enter_cells(tmp_path, [said.model_copy(update={"folder": plain.folder})])
+    assert [cell.settings for cell in read_plan(tmp_path).cells] == [{}, {}]
 
 
 def test_each_row_is_measured_by_the_deepsdf_of_its_own_settings(tmp_path):

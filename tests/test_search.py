@@ -219,6 +219,15 @@ def test_the_settings_of_a_search_of_one_trial_are_those_that_it_drew(search):
     assert "trainer.precision" not in trial.settings
 
 
+def test_what_a_search_was_told_with_a_plus_or_a_tilde_was_not_drawn(search):
+    from benchmarks.searches import KEYS, read_search
+
+    assert search.start("search.trials=1", "~tuned", "+trainer.max_steps=7") == 0
+    (trial,) = read_search(search.folders()[0])
+    assert {"tuned", "trainer.max_steps"}.isdisjoint(trial.settings) and "optim.lr_codes" in trial.settings
+    assert KEYS.findall("python a=1 '~b' '+c.d=[x, y' 'e=cut") == ["python", "a", "b", "c.d", "y", "e"]
+
+
 def test_a_table_of_trials_that_is_none_is_refused_by_name(tmp_path):
     from benchmarks.searches import read_csv
 

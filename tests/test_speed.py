@@ -1,5 +1,6 @@
 """Every fast path equals its plain twin."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from functools import partial
@@ -7,6 +8,7 @@ from functools import partial
 import pytest
 import torch
 import torch.nn.functional as F
+from torch._dynamo.backends.common import aot_autograd
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
@@ -380,6 +382,20 @@ def test_what_does_not_compile_runs_as_it_is_unless_it_was_asked_for(monkeypatch
     (asked,) = Computing(compile=True).compiled(len, device=torch.device("cuda"))
     with pytest.raises(RuntimeError, match="PTXAS"):
         asked("abc")
+
+
+def test_a_backward_pass_that_does_not_compile_is_noticed_in_time(monkeypatch):
+    def refuse(graph, inputs):
+        raise RuntimeError("PTXAS: too much shared memory")
+
+    backend = aot_autograd(fw_compiler=lambda graph, inputs: graph, bw_compiler=refuse)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
+    monkeypatch.setattr(computing, "can_compile", lambda device: True)
+    (wave,) = Computing().compiled(lambda x: x * x.sin(), device=torch.device("cuda"))
+    x = torch.ones(3, requires_grad=True)
+    with pytest.warns(UserWarning, match="goes on without, RuntimeError: PTXAS: too much shared memory$"):
+        wave(x).sum().backward()
+    torch.testing.assert_close(x.grad, torch.full((3,), math.sin(1) + math.cos(1)))
 
 
 def test_pieces_are_differentiated_outside_of_autocast_as_a_whole_batch_is():

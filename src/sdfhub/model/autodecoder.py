@@ -109,7 +109,7 @@ class AutoDecoder(L.LightningModule):
         self, optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
         # Lightning clips no gradients of a fused optimiser under mixed precision, for fear of a loss scale
-        if gradient_clip_val:
+        if gradient_clip_val is not None and gradient_clip_val > 0:
             weights = [p for group in optimizer.param_groups for p in group["params"]]
             by_value = gradient_clip_algorithm == "value"
             clip = torch.nn.utils.clip_grad_value_ if by_value else torch.nn.utils.clip_grad_norm_

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from typing import Literal
 
 import torch
+import torch._functorch.config as aot
 
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 """Samples worked on together: what stays in a CPU's caches; what fills a GPU and not its memory."""
@@ -73,19 +74,24 @@ def can_compile(device: torch.device) -> bool:
 
 
 def plain_if_broken(fast: Callable, plain: Callable) -> Callable:
-    """Calls `fast`, and from its first failure on `plain`, whose failure is the caller's."""
+    """Calls `fast`, and from its first failure on `plain`, whose failure is the caller's.
+
+    The backward pass is compiled with the forward one, so that its failure counts too.
+    """
     broken = False
 
     def call(*arguments):
         nonlocal broken
         if not broken:
             try:
-                return fast(*arguments)
+                with aot.patch(force_non_lazy_backward_lowering=True):  # later, nobody could go on without
+                    return fast(*arguments)
             except torch.OutOfMemoryError:
                 raise
             except Exception as error:
                 broken = True
-                reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+                cause = getattr(error, "inner_exception", error)
+                reason = f"{type(cause).__name__}: {str(cause).strip().partition(chr(10))[0]}"
                 warnings.warn(f"computing.compile: goes on without, {reason}", stacklevel=2)
         return plain(*arguments)
 

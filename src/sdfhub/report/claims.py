@@ -14,7 +14,7 @@ class Verdict:
 
     Args:
         claim: what was claimed.
-        state: `not tested` where a figure that could decide it is missing.
+        state: `not tested` where a deciding figure is missing or differs by the noise of sampling alone.
         figures: the figures behind the verdict, or what is missing, one comparison each.
         within_noise: confidence intervals over seeds overlap in comparisons without which the verdict falls.
         one_seed: a comparison without which the verdict falls has a side of one seed, whose noise is unknown.

@@ -88,14 +88,15 @@ def csv_text(groups: list[Group]) -> str:
     quantities += ("sdf_error_mean", "sdf_error_median", "sign_accuracy_mean")
     costs = ("seconds", "parameters", "epochs", "steps", "samples", "trained_on")
     named: list[Callable] = [lambda e: e.mean, lambda e: e.half_width, lambda e: e.seeds]
-    head = ["category", "data", "scale", "settings", "method", "normals", "detail", "role", "cells"]
+    places = ("category", "data", "scale", "fit", "evaluate")
+    head = [*places, "settings", "method", "normals", "detail", "role", "cells"]
     head += [f"{quantity}{part}" for quantity in quantities for part in ("", "_ci95", "_seeds")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*head, *costs])
     for group in groups:
         said = ";".join(f"{key}={value}" for key, value in (group.said | group.settings).items())
-        place = [*(group.choices.get(name, "") for name in ("category", "data", "scale")), said]
+        place = [*(group.choices.get(name, "") for name in places), said]
         for row in group.rows:
             for role in ROLES:
                 found = [row.estimate(quantity, role) for quantity in quantities]

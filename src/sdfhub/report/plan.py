@@ -82,7 +82,9 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None =
     with locked(sweep / ".lock"):
         old = read_plan(sweep) if (sweep / PLAN).exists() else Plan()
         known = {cell.identity: cell for cell in (*old.cells, *cells)}
-        by_folder = {cell.folder: cell for cell in known.values()}  # seed=0 said or left out is one cell
+        wordy_first = sorted(known.values(), key=lambda cell: -len(cell.settings))
+        shortest = {cell.folder: cell for cell in wordy_first}  # a default said or left out is one cell
+        by_folder = {cell.folder: shortest[cell.folder] for cell in known.values()}
         commands = dict.fromkeys([*old.commands, *([command[:2000]] if command else [])])
         plan = Plan(cells=list(by_folder.values()), commands=list(commands))
         write_whole(sweep / PLAN, json.dumps(plan.model_dump(), indent=1).encode())

@@ -122,12 +122,14 @@ class Group:
 
     Args:
         choices: what they share of OF_THE_GROUP.
+        told: names of choices that a title tells: without one, groups of the sweep would share a title.
         said: settings of the command line that decide which shapes are judged, and how.
         settings: values on the command line that all of them share beside.
         rows: in the order of the paper, then of the command.
     """
 
     choices: dict[str, str]
+    told: list[str]
     said: dict[str, str]
     settings: dict[str, str]
     rows: list[Row]
@@ -139,7 +141,7 @@ class Group:
         counted = (
             [f"trained on {' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))}"] if shapes else []
         )
-        named = [f"{name}={self.choices[name]}" for name in ("data", "scale") if name in self.choices]
+        named = [f"{name}={self.choices[name]}" for name in self.told if name in self.choices]
         named += [f"{key}={value}" for key, value in self.said.items()]
         return ", ".join([self.choices.get("category", "all"), *named, *counted])
 
@@ -165,7 +167,14 @@ def group_cells(cells: list[Cell]) -> list[Group]:
     for cell in cells:
         choices = tuple(cell.plan.choices.get(name) for name in OF_THE_GROUP)
         by_group.setdefault((choices, tuple(_of_the_group(cell).items())), []).append(cell)
-    return [_group(members) for members in by_group.values()]
+    of_all = [dict(zip(OF_THE_GROUP, choices, strict=True)) for choices, _ in by_group]
+    told = [
+        name
+        for name in OF_THE_GROUP
+        if name in ("data", "scale")
+        or (name != "category" and len({choices[name] for choices in of_all}) > 1)
+    ]
+    return [_group(members, told) for members in by_group.values()]
 
 
 def _of_the_group(cell: Cell) -> dict[str, str]:
@@ -173,11 +182,11 @@ def _of_the_group(cell: Cell) -> dict[str, str]:
     return {
         key: value
         for key, value in sorted(cell.plan.settings.items())
-        if key.startswith(("data.", "evaluate.")) and not key.startswith("data.loader.")
+        if key.startswith(("data.", "evaluate.", "scale.small_table")) and not key.startswith("data.loader.")
     }
 
 
-def _group(cells: list[Cell]) -> Group:
+def _group(cells: list[Cell], told: list[str]) -> Group:
     said = _of_the_group(cells[0])
     common = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
     by_row: dict[tuple, list[Cell]] = {}
@@ -187,14 +196,14 @@ def _group(cells: list[Cell]) -> Group:
         by_row.setdefault((own, others), []).append(cell)
     names = {key: (_method(dict(key[1])), dict(key[1]).get("normals", "?")) for key in by_row}
     rows = [
-        Row(*names[key], ", ".join(filter(None, [told, differing])), seeds)
+        Row(*names[key], ", ".join(filter(None, [own, differing])), seeds)
         for key, members in by_row.items()
-        for told in [_detail(key, [k for k in by_row if names[k] == names[key]])]
+        for own in [_detail(key, [k for k in by_row if names[k] == names[key]])]
         for differing, seeds in _alike(members)
     ]
     rows.sort(key=lambda row: (_rank(row.method), row.normals != "on"))
     choices = {name: cells[0].plan.choices[name] for name in OF_THE_GROUP if name in cells[0].plan.choices}
-    return Group(choices, said, dict(sorted(common - set(said.items()))), rows)
+    return Group(choices, told, said, dict(sorted(common - set(said.items()))), rows)
 
 
 def _alike(cells: list[Cell]) -> list[tuple[str, list[Cell]]]:
@@ -219,7 +228,9 @@ def _alike(cells: list[Cell]) -> list[tuple[str, list[Cell]]]:
     found[-1][1].extend(cell for cell in cells if not cell.scores)
     by_values: dict[tuple, str] = {}
     for key in sorted({key for one, _ in found for key in one}):
-        values = tuple(_shortened(str(one.get(key, "unset"))) for one, _ in found)
+        whole = [str(one.get(key, "unset")) for one, _ in found]
+        short = [_shortened(value) for value in whole]
+        values = tuple(short if len(set(short)) == len(set(whole)) else whole)
         if len(set(values)) > 1:
             by_values.setdefault(values, key)  # interpolated into other places it is told once
     return [

@@ -1,5 +1,6 @@
 """Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
 
+import hashlib
 import re
 import sys
 from pathlib import Path
@@ -51,16 +52,13 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
         write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
     write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
     print(f"report: {out / 'report.html'}", flush=True)
-    failed = sum(cell.state == "failed" for cell in cells)
-    if failed:
-        again = "the command of the sweep tries them again"
-        print(f"sdfhub: {failed} of {len(cells)} cells failed; {again}", file=sys.stderr)
 
 
 def sheet_name(group: Group) -> str:
     """A name of its own for each group of a sweep."""
-    said = [f"{key}-{value}" for key, value in group.said.items()]
-    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *group.choices.values(), *said]))[:200]
+    said = ";".join(f"{key}={value}" for key, value in group.said.items())
+    digest = [hashlib.sha256(said.encode()).hexdigest()[:8]] if said else []
+    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *group.choices.values(), *digest]))
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
@@ -110,6 +108,12 @@ def report(config: dict[str, Any]) -> None:
     read_plan(sweep)  # what is no sweep gets no folder
     refuse_unwritable(folder)
     write_report(sweep, folder, shapes)
+    cells = read_sweep(sweep)
+    failed = [cell for cell in cells if cell.state == "failed"]
+    if failed:
+        is_search = any("search" in cell.plan.choices for cell in cells)
+        again = "" if is_search else "; the command of the sweep tries them again"
+        print(f"sdfhub: {len(failed)} of {len(cells)} cells failed{again}", file=sys.stderr)
 
 
 def main() -> None:
