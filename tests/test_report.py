@@ -15,7 +15,7 @@ import yaml
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.claims import verdicts
-from sdfhub.report.formats import csv_text, latex, markdown
+from sdfhub.report.formats import csv_text, latex, markdown, shapes_csv
 from sdfhub.report.meshes import Mesh, reconstruction
 from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
@@ -24,7 +24,7 @@ from sdfhub.report.pictures import Gallery, packed
 from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
-from sdfhub.report.tables import claims_table, tables
+from sdfhub.report.tables import claims_table, overview, tables
 from sdfhub.tasks import report as report_task
 from sdfhub.tasks.report import sheet_name, write_report
 from tests.sweep_folders import planned, score, write_cell, write_mesh
@@ -395,7 +395,7 @@ def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monk
     report_task.main()
     written = {path.name for path in (strange / "report").iterdir()}
     sheet = "sheet_table_small_procedural_chairs_cpu.png"
-    assert written == {"table.md", "table.tex", "table.csv", "report.html", sheet}
+    assert written == {"table.md", "table.tex", "table.csv", "shapes.csv", "report.html", sheet}
     assert "DeepSDF" in capsys.readouterr().out
 
 
@@ -522,6 +522,53 @@ def test_a_default_that_is_said_later_leaves_a_row_its_name(tmp_path):
     enter_cells(tmp_path, [plain, planned("SIREN")])
     enter_cells(tmp_path, [said.model_copy(update={"folder": plain.folder})])
     assert [cell.settings for cell in read_plan(tmp_path).cells] == [{}, {}]
+
+
+def test_several_tables_have_one_before_them_and_every_shape_a_line(tmp_path):
+    lamps = {"choices": planned("SIREN").choices | {"category": "lamps"}, "folder": "lamps"}
+    write_cell(tmp_path, planned("FFT/SIREN"), [0.15e-3, 0.25e-3, 0.65e-3])
+    write_cell(tmp_path, planned("SIREN", seed=0), [0.15e-3], [0.55e-3])
+    write_cell(tmp_path, planned("SIREN", seed=1), [0.35e-3], [None])
+    write_cell(tmp_path, planned("SIREN").model_copy(update=lamps), [0.06e-3, None])
+    groups = group_cells(read_sweep(tmp_path))
+    known, held_out = overview(groups)
+    assert known.head == ["method", "chairs, trained on 1 to 3", "lamps, trained on 2"]
+    assert [row[:2] for row in known.rows] == [
+        ["SIREN + normals", "0.2000, 0.2000 (2)"],
+        ["FFT/SIREN + normals", "0.3000, 0.2000"],
+    ]
+    assert [row[2] for row in known.rows] == ["199.98, 199.98", "–"]
+    assert [row[1:] for row in held_out.rows] == [["200.23, 200.23 (2)", "–"], ["–", "–"]]
+    assert overview(groups[:1]) == []
+    lines = list(csv.DictReader(shapes_csv(groups).splitlines()))
+    assert len(lines) == 3 + 4 + 2
+    (lost,) = [line for line in lines if line["role"] == "held_out" and line["seed"] == "1"]
+    assert (lost["shape"], lost["cd"], float(lost["excess"])) == (
+        "chairs/0100",
+        "",
+        pytest.approx(0.4 - 5e-5),
+    )
+    html = page_of(tmp_path)
+    assert html.count("<h2>All tables</h2>") == 1 and "199.98, 199.98" in html
+
+
+def test_fields_that_have_not_learnt_their_shapes_decide_no_claim(tmp_path):
+    write_cell(tmp_path, planned("DeepSDF", "off"), [0.4])
+    write_cell(tmp_path, planned("FFT/SIREN"), [0.3])
+    write_cell(tmp_path, planned("FFT/HOSC"), [0.02])
+    found = {one.claim.text: one for one in verdicts(only_group(tmp_path))}
+    surpasses = found["With positional encoding, any periodic activation surpasses DeepSDF in mean CD"]
+    assert surpasses.told == "not tested" and surpasses.figures[0].startswith("neither is near its shapes")
+
+
+def test_what_must_be_significant_needs_seeds(tmp_path):
+    for normals, cds in {"on": [0.1e-3, 0.11e-3], "off": [0.3e-3, 0.31e-3]}.items():
+        for seed, cd in enumerate(cds):
+            for method in ("SIREN", "FFT/SIREN", "FFT/HOSC"):
+                write_cell(tmp_path, planned(method, normals, seed), [cd])
+            found = {one.claim.text: one for one in verdicts(only_group(tmp_path))}
+            claim = found["Normals significantly improve the accuracy of SIREN, FFT/SIREN and FFT/HOSC"]
+            assert claim.told == ("holds" if (normals, seed) == ("off", 1) else "not tested")
 
 
 def test_each_row_is_measured_by_the_deepsdf_of_its_own_settings(tmp_path):

@@ -9,6 +9,9 @@ from sdfhub.report.results import ROLES
 from sdfhub.report.rows import THOUSANDFOLD, Group
 from sdfhub.report.tables import Table
 
+PLACES = ("category", "data", "scale", "fit", "evaluate")
+"""Choices that a line of a CSV file tells."""
+
 
 def markdown(tables: list[Table]) -> str:
     """Tables as GitHub's Markdown."""
@@ -79,6 +82,33 @@ def _latex_cell(text: str) -> str:
     return "".join(LATEX.get(c, c if c.isascii() and c.isprintable() else "?") for c in plain)
 
 
+def shapes_csv(groups: list[Group]) -> str:
+    """Every judged shape of every cell as numbers: a line a seed, role and shape.
+
+    Chamfer distances in normalised units squared, not times 10^3; no `cd` where there is no surface, whose
+    excess counts the CD of a single point.
+    """
+    head = [*PLACES, "settings", "method", "normals", "detail", "seed", "role", "shape"]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*head, "cd", "floor", "excess", "normal_consistency"])
+    for group in groups:
+        for row in group.rows:
+            for cell in row.done:
+                place = [*_place(group), row.method, row.normals, row.detail, cell.plan.seed]
+                for role, shapes in cell.scores.shapes.items():
+                    for s in shapes:
+                        numbers = [None if s.failed else s.cd, s.floor, s.excess, s.normal_consistency]
+                        writer.writerow([*place, role, s.id, *numbers])
+    return text.getvalue()
+
+
+def _place(group: Group) -> list[str]:
+    """The columns that tell a group from others."""
+    said = ";".join(f"{key}={value}" for key, value in (group.said | group.settings).items())
+    return [*(group.choices.get(name, "") for name in PLACES), said]
+
+
 def csv_text(groups: list[Group]) -> str:
     """Every row of every group as numbers: a line a role, mean, half width and seeds of each quantity.
 
@@ -88,15 +118,13 @@ def csv_text(groups: list[Group]) -> str:
     quantities += ("sdf_error_mean", "sdf_error_median", "sign_accuracy_mean")
     costs = ("seconds", "parameters", "epochs", "steps", "samples", "trained_on")
     named: list[Callable] = [lambda e: e.mean, lambda e: e.half_width, lambda e: e.seeds]
-    places = ("category", "data", "scale", "fit", "evaluate")
-    head = [*places, "settings", "method", "normals", "detail", "role", "cells"]
+    head = [*PLACES, "settings", "method", "normals", "detail", "role", "cells"]
     head += [f"{quantity}{part}" for quantity in quantities for part in ("", "_ci95", "_seeds")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*head, *costs])
     for group in groups:
-        said = ";".join(f"{key}={value}" for key, value in (group.said | group.settings).items())
-        place = [*(group.choices.get(name, "") for name in places), said]
+        place = _place(group)
         for row in group.rows:
             for role in ROLES:
                 found = [row.estimate(quantity, role) for quantity in quantities]

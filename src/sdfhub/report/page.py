@@ -16,7 +16,7 @@ from sdfhub.report.origin import installed_version
 from sdfhub.report.pictures import Gallery, Sheet, data_uri
 from sdfhub.report.results import Cell
 from sdfhub.report.rows import Group, Row
-from sdfhub.report.tables import Table, tables
+from sdfhub.report.tables import Table, overview, tables
 
 COLOURS = 8
 
@@ -64,6 +64,7 @@ def page(
         counts=_counts(cells),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         version=installed_version("sdfhub"),
+        overview=overview(groups),
         parts=parts,
         meshes=meshes,
         origin=origin,

@@ -137,13 +137,18 @@ class Group:
     @cached_property
     def title(self) -> str:
         """`chairs, data=open, scale=cpu, trained on 20`; settings of all rows stand below a table."""
+        return ", ".join(self.title_parts)
+
+    @property
+    def title_parts(self) -> list[str]:
+        """The words of the title, the category first."""
         shapes = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
         counted = (
             [f"trained on {' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))}"] if shapes else []
         )
         named = [f"{name}={self.choices[name]}" for name in self.told if name in self.choices]
         named += [f"{key}={value}" for key, value in self.said.items()]
-        return ", ".join([self.choices.get("category", "all"), *named, *counted])
+        return [self.choices.get("category", "all"), *named, *counted]
 
     def row(self, method: str, normals: str) -> Row | None:
         """The row of that method, where there is one and no other."""
@@ -201,7 +206,7 @@ def _group(cells: list[Cell], told: list[str]) -> Group:
         for own in [_detail(key, [k for k in by_row if names[k] == names[key]])]
         for differing, seeds in _alike(members)
     ]
-    rows.sort(key=lambda row: (_rank(row.method), row.normals != "on"))
+    rows.sort(key=lambda row: (rank(row.method), row.normals != "on"))
     choices = {name: cells[0].plan.choices[name] for name in OF_THE_GROUP if name in cells[0].plan.choices}
     return Group(choices, told, said, dict(sorted(common - set(said.items()))), rows)
 
@@ -250,7 +255,8 @@ def _encoding(choices: dict[str, str]) -> str:
     return PREFIXES.get(encoding, f"{encoding.upper()}/")
 
 
-def _rank(method: str) -> int:
+def rank(method: str) -> int:
+    """The place of a method among the paper's rows."""
     return ORDER.index(method) if method in ORDER else len(ORDER)
 
 

@@ -1,11 +1,12 @@
 """Groups of rows as tables of text: scores, the paper's figures beside them, costs, claims."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from sdfhub.report.claims import verdicts
 from sdfhub.report.paper import COSTS, PRINTED
 from sdfhub.report.results import ROLES
-from sdfhub.report.rows import Estimate, Group, Row, duration
+from sdfhub.report.rows import Estimate, Group, Row, duration, rank
 
 NONE = "–"
 """An empty cell of a table."""
@@ -48,6 +49,45 @@ def tables(group: Group) -> list[Table]:
     return [*found[:1], *beside, *found[1:], *distances, _costs(group), *_missing(group)]
 
 
+def overview(groups: list[Group]) -> list[Table]:
+    """Mean and median excess of every row in every group, a table a role; none where there is one group."""
+    if len(groups) < 2:
+        return []
+    common = set.intersection(*(set(group.title_parts) for group in groups))
+    names = [
+        ", ".join(part for k, part in enumerate(group.title_parts) if k == 0 or part not in common)
+        for group in groups
+    ]
+    by_label = [{row.label: row for row in group.rows} for group in groups]
+    labels = sorted(dict.fromkeys(label for rows in by_label for label in rows), key=_place(groups))
+    found = []
+    for role in ROLES:
+        rows = [[label, *(_excess(rows.get(label), role) for rows in by_label)] for label in labels]
+        if any(cell != NONE for row in rows for cell in row[1:]):
+            title = f"{TITLES[role]}, excess mean and median: all tables"
+            found.append(Table(title, ["method", *names], rows, [_OVERVIEW_NOTE]))
+    return found
+
+
+_OVERVIEW_NOTE = (
+    "Excess CD over the noise floor times 10³, mean and median over shapes; in brackets the seeds that they "
+    "are means of, where these are several: the tables below have their intervals."
+)
+
+
+def _place(groups: list[Group]) -> Callable[[str], tuple[int, int]]:
+    """Sorts labels as the paper's rows, then as the groups have them."""
+    places = {row.label: (k, row) for group in groups for k, row in enumerate(group.rows)}
+    return lambda label: (rank(places[label][1].method), places[label][0])
+
+
+def _excess(row: Row | None, role: str) -> str:
+    values = [row.estimate(f"excess_{one}", role) for one in ("mean", "median")] if row else []
+    told = [_told(v, 4 if abs(v.mean) < 0.01 else 2, 1e3).partition(" ")[0] for v in values if v]
+    several = f" ({values[0].seeds})" if told and values[0].seeds > 1 else ""
+    return f"{', '.join(told)}{several}" if told else NONE
+
+
 def _judged_by(group: Group, quantity: str) -> list[str]:
     return [role for role in ROLES if any(row.estimate(quantity, role) for row in group.rows)]
 
@@ -65,7 +105,8 @@ def _scores(group: Group, role: str) -> Table:
     notes = [
         "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
         "samplings of the truth. Shapes without a surface count with the CD of a single point. Normals: mean "
-        "|cos| between those of the reconstruction and of the truth, of shapes with a surface. "
+        "|cos| between those of the reconstruction and of the truth, of shapes with a surface. The floor "
+        "is a mean over shapes: that of a single one, and so a median CD, may lie below it. "
         "± is a 95% confidence interval over seeds (Student's t); bold: the lowest, however near others are."
     ]
     if group.settings:

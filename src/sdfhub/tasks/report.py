@@ -12,7 +12,7 @@ from sdfhub.data.shards import StoredShape
 from sdfhub.data.store import Store, preparation_hash
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
-from sdfhub.report.formats import csv_text, latex, markdown
+from sdfhub.report.formats import csv_text, latex, markdown, shapes_csv
 from sdfhub.report.meshes import FindTruth
 from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
@@ -20,7 +20,7 @@ from sdfhub.report.pictures import Gallery, Sheet
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import Group, group_cells
-from sdfhub.report.tables import claims_table, tables
+from sdfhub.report.tables import claims_table, overview, tables
 from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.run import refuse_unwritable
@@ -28,7 +28,7 @@ from sdfhub.whole_file import write_whole
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
-    """Writes `table.md`, `.tex` and `.csv`, a contact sheet a group and `report.html`; prints the tables.
+    """Writes tables (md, tex, csv), `shapes.csv`, a sheet a group and `report.html`; prints the tables.
 
     Args:
         sweep: folder of a multirun, finished or not.
@@ -40,13 +40,14 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     """
     cells = read_sweep(sweep)
     groups = group_cells(cells)
-    all_tables = [table for group in groups for table in tables(group)]
+    all_tables = [*overview(groups), *(table for group in groups for table in tables(group))]
     print("\n" + markdown(all_tables))
     claims = [claims_table(group) for group in groups]
     origin = origin_table(read_plan(sweep).commands, cells)
     write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims, origin])}")
     write_whole(out / "table.tex", latex(all_tables))
     write_whole(out / "table.csv", csv_text(groups))
+    write_whole(out / "shapes.csv", shapes_csv(groups))
     gallery = Gallery(truth_finder())
     for group in groups:
         write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
