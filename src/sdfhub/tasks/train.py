@@ -43,6 +43,7 @@ from sdfhub.tasks.run import (
     refuse_unwritable,
 )
 from sdfhub.tasks.search import objective
+from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""
@@ -275,11 +276,10 @@ def main() -> None:
 
     def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
-        if all(hydra.runtime.choices.get(group) for group in ("sweeps", "search")):
-            raise SdfhubError("search= and sweeps=: a search is no table; leave one of them out")
         if hydra.mode == RunMode.MULTIRUN:
             return objective(run_cell(train, config, hydra))
-        for group in ("sweeps", "search"):
+        refuse_second_multirun(hydra)  # or it would be told to add -m, and then this
+        for group in MULTIRUNS:
             if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
                 raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
         folder = Path(hydra.runtime.output_dir)
