@@ -192,7 +192,15 @@ def test_a_search_and_another_multirun_are_refused_before_a_folder(word, told, s
 def test_a_budget_that_is_none_is_refused_by_name_before_a_folder(trials, search, capsys, tmp_path):
     assert search.start(f"search.trials={trials}") == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("sdfhub: error: search.trials=") and not list(tmp_path.iterdir())
+    assert line.startswith("sdfhub: error: search.trials=") and line.endswith(
+        ": must be a whole number, at least 1"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_budget_with_a_point_is_the_same_number(search):
+    assert search.start("search.trials=2.0") == 0
+    assert len(search.rates) == 2
 
 
 def test_a_search_without_optuna_or_multirun_says_what_is_missing(monkeypatch, capsys, tmp_path):

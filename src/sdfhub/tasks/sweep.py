@@ -49,7 +49,7 @@ class SweepRecord(Callback):
             if not _is_training(config):
                 return
             if config.hydra.runtime.choices.get("search"):
-                check(OmegaConf.select(config, "search.trials"), PositiveInt, "search.trials")
+                refuse_bad_budget(OmegaConf.select(config, "search.trials"))
             self._planned = planned_cells(config)
         except (SdfhubError, HydraException) as error:  # here, before the sweeper makes a folder
             print(f"sdfhub: error: {one_line(error, config.hydra.job.config_name)}", file=sys.stderr)
@@ -126,6 +126,18 @@ def refuse_second_multirun(hydra: DictConfig) -> None:
             raise SdfhubError(f"{word.input_line}: takes one name; start them one after another")
     if all(hydra.runtime.choices.get(group) for group in MULTIRUNS):
         raise SdfhubError("search= and sweeps=: a search is no table; leave one of them out")
+
+
+def refuse_bad_budget(trials: Any) -> None:
+    """Refuses a number of trials that is none, before a study is made for them.
+
+    Raises:
+        SdfhubError: names the key.
+    """
+    try:
+        check(trials, PositiveInt, "search.trials")
+    except SdfhubError as error:
+        raise SdfhubError(f"search.trials={trials}: must be a whole number, at least 1") from error
 
 
 def command_line(config: DictConfig) -> str:
