@@ -36,7 +36,6 @@ from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
     begin_run,
     build_autodecoder,
-    leave_no_empty_folder,
     put_weights,
     read_run,
     read_weights,
@@ -282,12 +281,7 @@ def main() -> None:
         for group in MULTIRUNS:
             if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
                 raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
-        folder = Path(hydra.runtime.output_dir)
-        try:
-            go_on(train, plain(config), folder)
-        except SdfhubError:
-            leave_no_empty_folder(folder)
-            raise
+        go_on(train, plain(config), Path(hydra.runtime.output_dir))
         return None
 
     run_task(task, "config")
