@@ -126,7 +126,48 @@ def test_a_misspelt_command_leaves_no_file_and_no_folder_of_a_run(tmp_path, monk
     monkeypatch.setattr(sys, "argv", ["train.py", "decoder.width=0", "hydra.run.dir=runs/first"])
     with pytest.raises(SystemExit):
         train_task.main()
-    assert [path.name for path in tmp_path.rglob("*")] == ["runs"]
+    assert not list(tmp_path.iterdir())
+
+
+REFUSED = ["seed=abc", "data=folder", "search=fft_hosc", "sweeps=smoke", "+foo=3", "data.store='${nowhere}'"]
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_a_refused_run_leaves_no_folder_and_takes_none_away(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mine = ["mine", "runs", "runs/empty", "runs/full", "runs/full/a"]
+    for name in mine[1:4]:
+        Path(name).mkdir()
+    for name in ("mine", "runs/full/a"):
+        Path(name).touch()
+    for place in ([], *([f"hydra.run.dir={folder}"] for folder in ("runs/empty", "runs/full", "runs/x/y"))):
+        monkeypatch.setattr(sys, "argv", ["train.py", word, *place])
+        with pytest.raises(SystemExit) as stop:
+            train_task.main()
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert stop.value.code == 2 and line.startswith("sdfhub: error: ")
+        assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == mine
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "hydra/launcher=joblib",
+        "hydra/launcher=submitit_slurm",
+        "hydra/sweeper=basic",
+        "hydra.sweeper.params=null",
+    ],
+)
+def test_what_only_a_multirun_reads_is_refused_without_one(word, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train.py", word])
+    with (
+        patch.object(train_task, "train", lambda *_: pytest.fail("trained")),
+        pytest.raises(SystemExit) as stop,
+    ):
+        train_task.main()
+    assert capsys.readouterr().err.strip() == f"sdfhub: error: {word}: needs -m"
+    assert stop.value.code == 2 and not list(tmp_path.iterdir())
 
 
 def test_the_environment_is_not_read_into_settings(tmp_path, monkeypatch):

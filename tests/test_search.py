@@ -175,6 +175,34 @@ def test_the_budget_is_no_setting_of_a_training():
     assert settings_digest(one) == settings_digest(other)
 
 
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("sweeps=smoke", "search= and sweeps=: a search is no table; leave one of them out"),
+        ("search=fft_hosc,siren", "search=fft_hosc,siren: takes one name"),
+    ],
+)
+def test_a_search_and_another_multirun_are_refused_before_a_folder(word, told, search, capsys, tmp_path):
+    assert search.start(word) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"sdfhub: error: {told}") and search.rates == [] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("trials", ["abc", "0", "-1", "1.5", "null"])
+def test_a_budget_that_is_none_is_refused_by_name_before_a_folder(trials, search, capsys, tmp_path):
+    assert search.start(f"search.trials={trials}") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("sdfhub: error: search.trials=") and line.endswith(
+        ": must be a whole number, at least 1"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_budget_with_a_point_is_the_same_number(search):
+    assert search.start("search.trials=2.0") == 0
+    assert len(search.rates) == 2
+
+
 def test_a_search_without_optuna_or_multirun_says_what_is_missing(monkeypatch, capsys, tmp_path):
     missing = ValueError("In 'search/siren': Could not find 'hydra/sweeper/optuna'\nAvailable options")
     assert "pip install 'sdfhub[optuna]'" in one_line(missing)

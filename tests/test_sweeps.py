@@ -278,6 +278,31 @@ def test_a_sweep_that_is_not_there_is_answered_with_those_that_are(trainer, monk
     assert "table_small" in told and "Traceback" not in told
 
 
+REFUSED = {
+    "sweeps=smoke,table_small": "sweeps=smoke,table_small: takes one name",
+    "experiment=siren,sirenn": "did you mean 'siren'?",
+    'hydra.sweeper.params.experiment="fft_siren,hosk"': "Could not find 'experiment/hosk' Available options",
+}
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_a_sweep_that_cannot_be_is_refused_in_one_line_before_a_folder(
+    word, trainer, monkeypatch, capsys, tmp_path
+):
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m", "sweeps=smoke", word])
+    assert status() == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("sdfhub: error: ") and REFUSED[word] in line
+    assert trainer.calls == [] and not list(tmp_path.iterdir())
+
+
+def test_a_sweep_whose_folders_only_its_jobs_know_is_trained(trainer, monkeypatch, tmp_path):
+    words = ["train.py", "-m", "sweeps=smoke", "seed=0", "hydra.sweep.subdir='${hydra.job.num}'"]
+    monkeypatch.setattr(sys, "argv", words)
+    assert status() == 0
+    assert [path.parent.name for path in sorted(tmp_path.rglob("metrics.json"))] == ["0", "1"]
+
+
 def test_seconds_and_losses_of_an_interrupted_training_count_when_it_goes_on():
     before, after = TrainingRecord(), TrainingRecord()
     before.load_state_dict({"seconds": 40.0, "first": [3.0] * 20, "last": [2.0] * 20})

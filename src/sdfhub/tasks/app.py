@@ -13,6 +13,7 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -65,6 +66,7 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
         nonlocal composed
         composed = True
         try:
+            refuse_multirun_words(HydraConfig.get())
             refuse_strangers(config, config_name)
             return task(config)
         except (SdfhubError, OmegaConfBaseException, OSError) as error:
@@ -141,6 +143,22 @@ def told_by_plugin(error: Exception) -> SdfhubError | None:
     return None
 
 
+def refuse_multirun_words(hydra: DictConfig) -> None:
+    """Refuses a launcher or a sweeper where there is one run: Hydra would take no notice of it.
+
+    Args:
+        hydra: Hydra's own part of a config.
+
+    Raises:
+        SdfhubError: names the word.
+    """
+    if hydra.mode == RunMode.MULTIRUN:
+        return
+    for word in hydra.overrides.hydra:
+        if re.match(r"\+*hydra[/.](launcher|sweeper)\b", word):
+            raise SdfhubError(f"{word}: needs -m")
+
+
 def refuse_strangers(config: DictConfig, config_name: str) -> None:
     """Refuses top-level keys that nothing reads, such as `+sweep=...`, and to go without those that are read.
 
@@ -179,12 +197,17 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     missing = re.match(r"Missing mandatory value: (\S+)", text)
     if missing:
         return f"{missing.group(1)}=...: must be given"
+    choice = re.search(r"Could not find '[^']+/([^'/]+)' Available options in '[^']+': (.+)", text)
+    if choice and (near := get_close_matches(choice.group(1), choice.group(2).split(), n=1)):
+        return f"{text}; did you mean {near[0]!r}?"
     return _no_such_key(unknown.group(1), config_name) if unknown else text
 
 
 def _no_such_key(key: str, config_name: str = "config") -> str:
     group, _, below = key.partition(".")
     groups = _groups()
+    if group == "hydra":
+        return f"there is no key {key!r}; {_hydra_hint(key)}"
     if group == "trainer" and below in _trainer_arguments():
         return f"{key}: conf/ does not set it; write +{key}=..."
     if below and group in groups:
@@ -197,6 +220,20 @@ def _no_such_key(key: str, config_name: str = "config") -> str:
     choices = f"the keys are {', '.join(own)}" if own else f"the groups are {', '.join(groups)}"
     hint = f"did you mean {near[0]!r}?" if near else choices
     return f"there is no group or key {key!r}; {hint}"
+
+
+def _hydra_hint(key: str) -> str:
+    """Where there would be such a key of Hydra's own part: most are those of a launcher."""
+    owners: dict[str, list[str]] = {}
+    for path in sorted((configuration_folder() / "hydra" / "launcher").glob("*.yaml")):
+        for leaf in _leaves(_yaml(path)):
+            owners.setdefault(f"hydra.launcher.{leaf}", []).append(f"hydra/launcher={path.stem}")
+    if key in owners:
+        return f"add {' or '.join(owners[key])}, which has it"
+    near = get_close_matches(key, owners, n=1, cutoff=0.85)
+    if near:
+        return f"did you mean {near[0]!r} of {' or '.join(owners[near[0]])}?"
+    return "--cfg hydra shows those that there are"
 
 
 def _trainer_arguments() -> list[str]:

@@ -3,7 +3,6 @@
 import os
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
@@ -14,9 +13,9 @@ OF_A_ROW = ("activation", "encoding", "normals", "decoder", "conditioning", "opt
 """Parts of a config that the rows of a table differ in."""
 
 
-def run_name() -> str:
+def run_name(*, _root_: DictConfig) -> str:
     """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
-    return _joined(HydraConfig.get().runtime.choices)
+    return _joined(_root_.hydra.runtime.choices)
 
 
 def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:

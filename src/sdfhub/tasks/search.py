@@ -39,7 +39,7 @@ def trials_left(total: int, storage: str, study: str) -> int:
         storage: URL of the study's database.
         study: its name there.
     """
-    return max(0, total - trials_done(storage, study))
+    return max(0, int(total) - trials_done(storage, study))
 
 
 def trials_done(storage: str, study: str) -> int:

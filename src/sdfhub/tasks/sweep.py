@@ -10,17 +10,23 @@ from typing import Any
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
+from pydantic import PositiveInt
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
 from sdfhub.tasks.app import one_line, register_resolvers
+from sdfhub.tasks.build import check
 from sdfhub.tasks.cells import planned_cell
 
 EXTRAS = {"submitit": "slurm", "joblib": "joblib", "optuna": "optuna"}
 """What to install of sdfhub for a launcher or sweeper, by the name of its plugin."""
+
+MULTIRUNS = ("sweeps", "search")
+"""Groups whose choices say what a multirun's cells are."""
 
 
 class SweepRecord(Callback):
@@ -39,21 +45,20 @@ class SweepRecord(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         try:
             refuse_missing_plugins(config)
-        except SdfhubError as error:
-            print(f"sdfhub: error: {error}", file=sys.stderr)
+            refuse_second_multirun(config.hydra)
+            if not _is_training(config):
+                return
+            if config.hydra.runtime.choices.get("search"):
+                refuse_bad_budget(OmegaConf.select(config, "search.trials"))
+            self._planned = planned_cells(config)
+        except (SdfhubError, HydraException) as error:  # here, before the sweeper makes a folder
+            print(f"sdfhub: error: {one_line(error, config.hydra.job.config_name)}", file=sys.stderr)
             sys.exit(2)
-        if not _is_training(config):
+        except Exception as error:  # such as a folder's name that only its job will know
+            print(f"sdfhub: the sweep cannot be planned: {one_line(error)}", file=sys.stderr)
             return
         if config.hydra.runtime.choices.get("search"):
             hold_search(Path(config.hydra.sweep.dir))
-        try:
-            self._planned = planned_cells(config)
-        except SdfhubError as error:
-            print(f"sdfhub: error: {error}", file=sys.stderr)
-            sys.exit(2)
-        except Exception as error:  # the sweeper composes the same, and tells it better
-            print(f"sdfhub: the sweep cannot be planned: {error}", file=sys.stderr)
-            return
         enter_cells(Path(config.hydra.sweep.dir), self._planned, command_line(config))
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -102,6 +107,37 @@ def refuse_missing_plugins(config: DictConfig) -> None:
                 f"hydra/{role}={config.hydra.runtime.choices[f'hydra/{role}']}: is not installed here; "
                 f"pip install 'sdfhub[{EXTRAS[name]}]'"
             )
+
+
+def refuse_second_multirun(hydra: DictConfig) -> None:
+    """Refuses a command that asks for a sweep and a search, or for several of them.
+
+    Rows and trials are the sweeper's, which a command has one of: of a second it would know nothing, and of
+    `sweeps=a,b`, which is chosen cell by cell, neither.
+
+    Args:
+        hydra: Hydra's own part of a config.
+
+    Raises:
+        SdfhubError: names the groups.
+    """
+    for word in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        if word.key_or_group in MULTIRUNS and word.is_sweep_override():
+            raise SdfhubError(f"{word.input_line}: takes one name; start them one after another")
+    if all(hydra.runtime.choices.get(group) for group in MULTIRUNS):
+        raise SdfhubError("search= and sweeps=: a search is no table; leave one of them out")
+
+
+def refuse_bad_budget(trials: Any) -> None:
+    """Refuses a number of trials that is none, before a study is made for them.
+
+    Raises:
+        SdfhubError: names the key.
+    """
+    try:
+        check(trials, PositiveInt, "search.trials")
+    except SdfhubError as error:
+        raise SdfhubError(f"search.trials={trials}: must be a whole number, at least 1") from error
 
 
 def command_line(config: DictConfig) -> str:

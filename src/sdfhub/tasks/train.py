@@ -36,13 +36,13 @@ from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
     begin_run,
     build_autodecoder,
-    leave_no_empty_folder,
     put_weights,
     read_run,
     read_weights,
     refuse_unwritable,
 )
 from sdfhub.tasks.search import objective
+from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""
@@ -275,19 +275,13 @@ def main() -> None:
 
     def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
-        if all(hydra.runtime.choices.get(group) for group in ("sweeps", "search")):
-            raise SdfhubError("search= and sweeps=: a search is no table; leave one of them out")
         if hydra.mode == RunMode.MULTIRUN:
             return objective(run_cell(train, config, hydra))
-        for group in ("sweeps", "search"):
+        refuse_second_multirun(hydra)  # or it would be told to add -m, and then this
+        for group in MULTIRUNS:
             if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
                 raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
-        folder = Path(hydra.runtime.output_dir)
-        try:
-            go_on(train, plain(config), folder)
-        except SdfhubError:
-            leave_no_empty_folder(folder)
-            raise
+        go_on(train, plain(config), Path(hydra.runtime.output_dir))
         return None
 
     run_task(task, "config")
