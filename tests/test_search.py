@@ -180,9 +180,11 @@ def test_the_budget_is_no_setting_of_a_training():
     [
         ("sweeps=smoke", "search= and sweeps=: a search is no table; leave one of them out"),
         ("search=fft_hosc,siren", "search=fft_hosc,siren: takes one name"),
+        ("seed=abc", "seed='abc': should be a valid integer"),
+        ("+foo=3", "there is no group or key 'foo'"),
     ],
 )
-def test_a_search_and_another_multirun_are_refused_before_a_folder(word, told, search, capsys, tmp_path):
+def test_a_search_that_cannot_be_is_refused_once_before_a_folder(word, told, search, capsys, tmp_path):
     assert search.start(word) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith(f"sdfhub: error: {told}") and search.rates == [] and not list(tmp_path.iterdir())

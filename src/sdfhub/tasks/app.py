@@ -67,7 +67,7 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
         composed = True
         try:
             refuse_multirun_words(HydraConfig.get())
-            refuse_strangers(config, config_name)
+            refuse_strangers(config, config_name, HydraConfig.get())
             return task(config)
         except (SdfhubError, OmegaConfBaseException, OSError) as error:
             if verbose:
@@ -159,8 +159,13 @@ def refuse_multirun_words(hydra: DictConfig) -> None:
             raise SdfhubError(f"{word}: needs -m")
 
 
-def refuse_strangers(config: DictConfig, config_name: str) -> None:
+def refuse_strangers(config: DictConfig, config_name: str, hydra: DictConfig) -> None:
     """Refuses top-level keys that nothing reads, such as `+sweep=...`, and to go without those that are read.
+
+    Args:
+        config: composed; Hydra's own part may be in it.
+        config_name: of the task.
+        hydra: Hydra's own part.
 
     Raises:
         SdfhubError: names the key.
@@ -170,7 +175,7 @@ def refuse_strangers(config: DictConfig, config_name: str) -> None:
         if key not in {*_groups(), *read[0], *read[1]}:
             raise SdfhubError(_no_such_key(str(key), config_name))
     node = {key: value for key, value in read[1].items() if key not in ("defaults", "hydra")}
-    there = {*_leaves(OmegaConf.to_container(config, resolve=False)), *HydraConfig.get().runtime.choices}
+    there = {*_leaves(OmegaConf.to_container(config, resolve=False)), *hydra.runtime.choices}
     groups = [group for group, choice in _composed_groups(config_name).items() if choice and " " not in group]
     for key in (*groups, *_leaves(node)):
         if key not in there:

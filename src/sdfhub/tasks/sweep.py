@@ -18,8 +18,8 @@ from pydantic import PositiveInt
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
-from sdfhub.tasks.app import one_line, register_resolvers
-from sdfhub.tasks.build import check
+from sdfhub.tasks.app import one_line, refuse_strangers, register_resolvers
+from sdfhub.tasks.build import Seed, check
 from sdfhub.tasks.cells import planned_cell
 
 EXTRAS = {"submitit": "slurm", "joblib": "joblib", "optuna": "optuna"}
@@ -46,10 +46,12 @@ class SweepRecord(Callback):
         try:
             refuse_missing_plugins(config)
             refuse_second_multirun(config.hydra)
+            refuse_strangers(config, config.hydra.job.config_name, config.hydra)
             if not _is_training(config):
                 return
             if config.hydra.runtime.choices.get("search"):
                 refuse_bad_budget(OmegaConf.select(config, "search.trials"))
+                check(config.seed, Seed, "seed")  # planning a sweep checks that of each cell
             self._planned = planned_cells(config)
         except (SdfhubError, HydraException) as error:  # here, before the sweeper makes a folder
             print(f"sdfhub: error: {one_line(error, config.hydra.job.config_name)}", file=sys.stderr)
