@@ -399,6 +399,21 @@ def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monk
     assert "DeepSDF" in capsys.readouterr().out
 
 
+def test_a_report_says_what_failed_and_that_only_a_sweep_tries_it_again(tmp_path, capsys):
+    for name, more, end in (
+        ("table", {}, "; the command of the sweep tries them again"),
+        ("search", {"search": "siren"}, ""),
+    ):
+        good, bad = planned("SIREN"), planned("SIREN", seed=1)
+        good, bad = (cell.model_copy(update={"choices": cell.choices | more}) for cell in (good, bad))
+        write_cell(tmp_path / name, good, [0.1e-3])
+        enter_cells(tmp_path / name, [bad])
+        (tmp_path / name / bad.folder).mkdir()
+        (tmp_path / name / bad.folder / "failed.json").write_text('{"reason": "diverged", "traceback": ""}')
+        report_task.report({"sweep": str(tmp_path / name), "out": None, "shapes": 1})
+        assert capsys.readouterr().err.strip() == f"sdfhub: 1 of 2 cells failed{end}"
+
+
 def test_what_is_no_sweep_gets_no_folder(tmp_path):
     with pytest.raises(SdfhubError, match="not the folder of a multirun"):
         report_task.report({"sweep": str(tmp_path / "nothere"), "out": None, "shapes": 2})

@@ -27,13 +27,16 @@ from sdfhub.tasks.run import refuse_unwritable
 from sdfhub.whole_file import write_whole
 
 
-def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
+def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     """Writes tables (md, tex, csv), `shapes.csv`, a sheet a group and `report.html`; prints the tables.
 
     Args:
         sweep: folder of a multirun, finished or not.
         out: folder of the report.
         shapes: pictured side by side.
+
+    Returns:
+        the cells of the sweep.
 
     Raises:
         SdfhubError: not a sweep's folder.
@@ -53,6 +56,7 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
         write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
     write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
     print(f"report: {out / 'report.html'}", flush=True)
+    return cells
 
 
 def sheet_name(group: Group) -> str:
@@ -108,8 +112,7 @@ def report(config: dict[str, Any]) -> None:
     folder = Path(out) if out else sweep / "report"
     read_plan(sweep)  # what is no sweep gets no folder
     refuse_unwritable(folder)
-    write_report(sweep, folder, shapes)
-    cells = read_sweep(sweep)
+    cells = write_report(sweep, folder, shapes)
     failed = [cell for cell in cells if cell.state == "failed"]
     if failed:
         is_search = any("search" in cell.plan.choices for cell in cells)
