@@ -4,9 +4,9 @@
     python benchmarks/training.py --device cuda --shapes 64 --samples 16384
 
 Every round times one step of each rival, one after the other, so that a machine's moods hit all alike;
-printed are medians over the rounds. DeepSDF's step is re-implemented here from its description: its network
-(weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the batch, its
-prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours include the
+printed are medians over the rounds. DeepSDF's step is re-implemented in reference.py from its description: its
+network (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the batch,
+its prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours include the
 draw of their samples from the store. Only samples with a signed distance are counted: what normals cost is
 on our account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
 decoder, timed in the same rounds.
@@ -15,7 +15,8 @@ On a GPU our samples lie in its memory and the decoder is compiled, as `trainer=
 is given samples that wait on the device, as if its loaders took no time, and works on a batch in four parts
 (its `batch_split`), or it would not fit. float32 products are TF32 there, for all. The second limit:
 the bytes that have to move if every product and every pass between two of them reads what it needs and
-writes what it makes once, at the rate of a copy.
+writes what it makes once, at the rate of a copy. There too encoding=hash, by tensor operations and, where it
+is installed, by tiny-cuda-nn.
 """
 
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
@@ -27,14 +28,13 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from hydra import compose, initialize_config_dir
-from torch import nn
-from torch.nn.utils.parametrizations import weight_norm
+from reference import ReferenceStep
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
@@ -46,6 +46,8 @@ from sdfhub.tasks.run import build_autodecoder
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STORED = 100_000
 """Samples of each kind in a shape's file; a draw does not depend on what they are."""
+PAPER_SAMPLES = 2000 * 16_384
+"""Samples of a shape in the paper's training."""
 
 
 @dataclass
@@ -73,74 +75,6 @@ class RandomShape:
         if start + count <= len(array):
             return array[start : start + count].copy()
         return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
-
-
-class ReferenceDecoder(nn.Module):
-    """DeepSDF's network: 8 hidden layers of 512, input re-injected at the fourth, the code at every point."""
-
-    def __init__(self, code_size: int = 256, width: int = 512, depth: int = 8, again: int = 4):
-        super().__init__()
-        given = code_size + 3
-        sizes = [given] + [width] * depth
-        layers = []
-        for index in range(depth):
-            emitted = width - given if index + 1 == again else width
-            layers.append(weight_norm(nn.Linear(sizes[index], emitted)))
-        self.layers, self.again = nn.ModuleList(layers), again
-        self.head = nn.Linear(width, 1)
-
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Signed distances [P, 1] of inputs [P, L + 3]."""
-        x = inputs
-        for index, layer in enumerate(self.layers):
-            if index == self.again:
-                x = torch.cat([x, inputs], dim=1)
-            x = F.dropout(F.relu(layer(x)), 0.2, self.training)
-        return torch.tanh(self.head(x))
-
-
-class ReferenceStep:
-    """One step of DeepSDF's published training."""
-
-    def __init__(self, files: list[Path], samples: int, device: torch.device):
-        self.files, self.samples, self.device = files, samples, device
-        self.decoder = ReferenceDecoder().to(device)
-        self.codes = nn.Embedding(len(files), 256, max_norm=1.0).to(device)
-        self.parts = 1 if device.type == "cpu" else 4
-        self.waiting = None if device.type == "cpu" else self._read()
-        nn.init.normal_(self.codes.weight, 0, 1 / 16)
-        groups = [
-            {"params": self.decoder.parameters(), "lr": 5e-4},
-            {"params": self.codes.parameters(), "lr": 1e-3},
-        ]
-        self.optimizer = torch.optim.Adam(groups)
-
-    def _load(self, file: Path) -> torch.Tensor:
-        """[N, 4] samples of one shape: half outside, half inside, without rows that are not numbers."""
-        drawn = []
-        with np.load(file) as arrays:
-            for name in ("pos", "neg"):
-                rows = torch.from_numpy(arrays[name])
-                rows = rows[~rows[:, 3].isnan()]
-                drawn.append(rows[(torch.rand(self.samples // 2) * len(rows)).long()])
-        return torch.cat(drawn)
-
-    def _read(self) -> torch.Tensor:
-        """[B * N, 4] samples of all shapes."""
-        return torch.cat([self._load(file) for file in self.files]).to(self.device)
-
-    def __call__(self) -> None:
-        rows = self._read() if self.waiting is None else self.waiting
-        which = torch.arange(len(self.files), device=self.device).repeat_interleave(self.samples)
-        self.optimizer.zero_grad()
-        for some, of_shapes in zip(rows.chunk(self.parts), which.chunk(self.parts), strict=True):
-            target = some[:, 3:].clamp(-0.1, 0.1)
-            codes = self.codes(of_shapes)
-            predicted = self.decoder(torch.cat([codes, some[:, :3]], dim=1)).clamp(-0.1, 0.1)
-            loss = F.l1_loss(predicted, target, reduction="sum") / len(rows)
-            loss = loss + 1e-4 * codes.norm(dim=1).sum() / len(rows)
-            loss.backward()
-        self.optimizer.step()
 
 
 class OurStep:
@@ -282,6 +216,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
                 shapes, args.samples, surface, ["activation=siren", *paper], bf16, device
             ),
         }
+    made |= hash_steps(shapes, args, device) if device.type == "cuda" else {}
     fields = {
         "decoder=deepsdf": deepsdf,
         "paper_585k, HOSC": paper,
@@ -289,6 +224,20 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     }
     made |= {f"{name}, evaluation": OurField(choice, rows, device) for name, choice in fields.items()}
     return made
+
+
+def hash_steps(
+    shapes: list[RandomShape], args: argparse.Namespace, device: torch.device
+) -> dict[str, object]:
+    """Steps with a hash encoding in bfloat16, by each of the ways to compute it that there are here."""
+    ways = {"tensor operations": "false"} | ({"tiny-cuda-nn": "true"} if find_spec("tinycudann") else {})
+    choice = ["decoder=paper_585k", "encoding=hash", *args.overrides]
+    return {
+        f"paper_585k, HOSC + hash by {name}, normals=on, bf16": OurStep(
+            shapes, args.samples, args.samples // 4, [*choice, f"computing.tinycudann={there}"], True, device
+        )
+        for name, there in ways.items()
+    }
 
 
 def main() -> None:
@@ -381,6 +330,10 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -
     for bf16 in ("", ", bf16"):
         on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
         print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")
+    hours = [PAPER_SAMPLES * shapes * on / rows / 3600 for shapes in (100, 1000)]
+    print(
+        f"\nthe paper's training at that rate: {hours[0]:.2f} hours for 100 shapes, {hours[1]:.1f} for 1000"
+    )
 
 
 if __name__ == "__main__":

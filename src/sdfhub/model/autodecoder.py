@@ -56,10 +56,12 @@ class AutoDecoder(L.LightningModule):
 
     def on_fit_start(self) -> None:
         self.computing.set_up(self.device)
+        self.decoder.encoding = self.computing.quickest(self.decoder.encoding, self.device)
         passes = self.decoder.forward, self.decoder.value_and_gradient
         self._value, self._value_and_gradient = self.computing.compiled(*passes, device=self.device)
 
     def on_fit_end(self) -> None:
+        self.decoder.encoding = self.decoder.encoding.plain()
         self.computing.put_back()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:

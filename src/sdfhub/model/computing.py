@@ -12,6 +12,10 @@ from typing import Literal
 import torch
 import torch._functorch.config as aot
 
+from sdfhub.errors import SdfhubError
+from sdfhub.model.encodings import Encoding
+from sdfhub.model.fused_hash import fused
+
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 """Samples worked on together: what stays in a CPU's caches; what fills a GPU and not its memory."""
 
@@ -27,12 +31,15 @@ class Computing:
         points_at_once: samples that go through the decoder together, >= 1; bounds memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
             None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
+        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result. None: on a
+            GPU, where it is installed and agrees.
         matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
             (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
     """
 
     points_at_once: int | None = None
     compile: bool | None = None
+    tinycudann: bool | None = None
     matmul: Literal["highest", "high", "medium"] | None = None
 
     def __post_init__(self):
@@ -52,6 +59,22 @@ class Computing:
     def put_back() -> None:
         """Products are exact again, as PyTorch begins: what is trained is judged with all its digits."""
         torch.set_float32_matmul_precision("highest")
+
+    def quickest(self, encoding: Encoding, device: torch.device) -> Encoding:
+        """The encoding, or its twin by tiny-cuda-nn.
+
+        Raises:
+            SdfhubError: the twin was asked for, and there is none here.
+        """
+        if self.tinycudann is False:
+            return encoding
+        twin = fused(encoding, device)
+        if self.tinycudann and twin is encoding:
+            raise SdfhubError(
+                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, "
+                "and tiny-cuda-nn built for it; null takes it where it is there"
+            )
+        return twin
 
     def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
         """The functions themselves, or what `torch.compile` makes of them on this device.

@@ -34,6 +34,10 @@ class Encoding(nn.Module, ABC):
     def with_pullback(self, points: Tensor) -> tuple[Tensor, "Pullback"]:
         """Features [..., F] and the map of a cotangent v [..., F] to J(x)^T v [..., 3], differentiable."""
 
+    def plain(self) -> "Encoding":
+        """The encoding as tensor operations, with the same weights: itself, unless it is a faster twin."""
+        return self
+
 
 Pullback = Callable[[Tensor], Tensor]
 """What a cotangent of features is in space: [..., F] -> [..., 3]."""

@@ -1,0 +1,120 @@
+"""The hash encoding by tiny-cuda-nn, where that is installed: one kernel a level and direction, on a GPU.
+
+It is the function of `Hash` and reads its very table, so that a checkpoint does not know which of them
+trained it. Each level is a grid of its own, because tiny-cuda-nn ties the resolutions of a grid's levels.
+
+Source: https://github.com/NVlabs/tiny-cuda-nn, `GridEncoding` with a single level. Compared with `Hash` it
+reads places in [0, 1] and half a cell further, counts vertices where we count cells, lets the first axis of a
+directly indexed grid vary fastest, and holds a multiple of eight rows.
+"""
+
+import warnings
+from importlib import import_module
+from importlib.util import find_spec
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from sdfhub.model.encodings import Encoding, Hash, Pullback
+
+WIDTHS = (1, 2, 4, 8)
+"""Features a level that tiny-cuda-nn has kernels for."""
+PROBES, TOLERANCE = 4096, 1e-3
+"""Points at which a twin must agree with the tensor operations, and how far they may differ, relatively."""
+
+
+class FusedHash(Encoding):
+    """The same features as those of a `Hash`, from the same table.
+
+    Args:
+        plain: the encoding to compute, whose table this one shares.
+    """
+
+    def __init__(self, plain: Hash):
+        super().__init__()
+        self.features, self.width = plain.features, plain.width
+        self.include_points, self.rows, self.dense = plain.include_points, plain.rows, plain.dense
+        self.cells: list[int] = plain.cells.tolist()
+        self.table = plain.table
+        # in lists, so that neither the grids' own tables nor the twin's become weights of this module
+        self._plain, self._grids = [plain], [self._grid(cells) for cells in self.cells]
+
+    def _grid(self, cells: int) -> nn.Module:
+        config = {
+            "otype": "Grid",
+            "type": "Hash",
+            "n_levels": 1,
+            "n_features_per_level": self.width,
+            "log2_hashmap_size": (max(self.rows) - 1).bit_length(),
+            "base_resolution": cells + 1,
+            "per_level_scale": 1.0,
+            "interpolation": "Smoothstep",
+        }
+        return import_module("tinycudann").Encoding(3, config, dtype=torch.float32)
+
+    def plain(self) -> Encoding:
+        return self._plain[0]
+
+    @torch.compiler.disable
+    def forward(self, points: Tensor) -> Tensor:
+        places = (points.flatten(0, -2) + 1) / 2
+        tables = self.table.split(self.rows)
+        features = [points.flatten(0, -2)] if self.include_points else []
+        for level, (grid, cells, rows) in enumerate(zip(self._grids, self.cells, tables, strict=True)):
+            # a hash knows no border; a grid that is indexed directly goes on with its last value
+            inside = places.clamp(0, 1).flip(-1) if level < self.dense else places
+            padded = F.pad(rows.flatten(), (0, -len(rows) % 8 * self.width * (level < self.dense)))
+            features.append(functional_call(grid, {"params": padded}, (inside - 0.5 / cells,)))
+        return torch.cat(features, dim=-1).unflatten(0, points.shape[:-1])
+
+    @torch.compiler.disable
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        places = points if points.requires_grad else points.detach().requires_grad_()
+        with torch.enable_grad():
+            features = self(places)
+
+        @torch.compiler.disable
+        def pullback(cotangent: Tensor) -> Tensor:
+            # the one derivative that tiny-cuda-nn differentiates once more
+            differentiable = torch.is_grad_enabled()
+            return torch.autograd.grad(features, places, cotangent, create_graph=differentiable)[0]
+
+        return features, pullback
+
+
+def fused(plain: Encoding, device: torch.device) -> Encoding:
+    """The twin of a hash encoding on this device, or the encoding itself where there is none that agrees."""
+    fits = isinstance(plain, Hash) and plain.width in WIDTHS and device.type == "cuda"
+    if not fits or find_spec("tinycudann") is None:
+        return plain
+    try:
+        twin = FusedHash(plain)
+        difference = disagreement(twin, plain)
+    except Exception as error:  # whatever a library made for another GPU raises
+        reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+        warnings.warn(f"tinycudann: goes on without, {reason}", stacklevel=2)
+        return plain
+    if difference <= TOLERANCE:
+        return twin
+    warnings.warn(f"tinycudann: goes on without, its grid differs by {difference:.1e}", stacklevel=2)
+    return plain
+
+
+def disagreement(twin: Encoding, plain: Hash) -> float:
+    """Largest relative difference of features, their slopes, and the table's gradient through both."""
+    generator = torch.Generator().manual_seed(0)
+    points = (torch.rand(1, PROBES, 3, generator=generator) * 2.2 - 1.1).to(plain.table)
+    cotangent = torch.randn(1, PROBES, plain.features, generator=generator).to(plain.table)
+    cotangent[..., : 3 * plain.include_points] = 0  # the coordinates themselves would hide the table
+    found = []
+    for encoding in (twin, plain):
+        with torch.enable_grad():
+            features, pullback = encoding.with_pullback(points)
+            slopes = pullback(cotangent)
+            learned = (features * cotangent).sum() + slopes.square().sum() / slopes.detach().norm()
+            by_table = torch.autograd.grad(learned, plain.table)[0]
+        found.append([(features * cotangent).detach(), slopes.detach(), by_table])
+    ratios = [(one - other).norm() / other.norm() for one, other in zip(*found, strict=True)]
+    return float(torch.stack(ratios).nan_to_num(torch.inf).max())
