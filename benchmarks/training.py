@@ -4,12 +4,12 @@
     python benchmarks/training.py --device cuda --shapes 64 --samples 16384
 
 Every round times one step of each rival, one after the other, so that a machine's moods hit all alike;
-printed are medians over the rounds. DeepSDF's step is re-implemented in reference.py from its description: its
-network (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the batch,
-its prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours include the
-draw of their samples from the store. Only samples with a signed distance are counted: what normals cost is
-on our account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
-decoder, timed in the same rounds.
+printed are medians over the rounds. DeepSDF's step (reference.py) is re-implemented from its description:
+its network (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the
+batch, its prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours
+include the draw of their samples from the store. Only samples with a signed distance are counted: what
+normals cost is on our account. The limit is the rate of a product [points worked on together, W] x [W, W],
+W the width of the decoder, timed in the same rounds.
 
 On a GPU our samples lie in its memory and the decoder is compiled, as `trainer=gpu` does it; DeepSDF's step
 is given samples that wait on the device, as if its loaders took no time, and works on a batch in four parts
