@@ -37,11 +37,10 @@ lint: $(DEV_STAMP) ## check style
 data: install ## fetch and unpack the real meshes of data=open into data/open (no root needed)
 	$(BIN)/python -m sdfhub.data.fetch
 
-bench: install ## time preparation, meshing and training steps on this machine
-	$(BIN)/python benchmarks/procedural.py
-	$(BIN)/python benchmarks/preparation.py
-	$(BIN)/python benchmarks/meshing.py
-	$(BIN)/python benchmarks/training.py
+BENCHMARKS := training growth procedural preparation large_mesh meshing evaluation fitting accuracy
+
+bench: install ## time all of it on this machine (an hour of two cores, 9 GB of disk meanwhile)
+	for each in $(BENCHMARKS); do echo "\n$$each.py"; $(BIN)/python benchmarks/$$each.py || exit 1; done
 
 clean: ## remove the environment; prepared data and runs stay
 	rm -rf $(VENV)
