@@ -330,6 +330,11 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -
     for bf16 in ("", ", bf16"):
         on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
         print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")
+    paper = steps["paper_585k, HOSC, normals=on, bf16"]
+    print(
+        f"\na sample of it, bf16: {paper.operations() / rows / 1e6:.2f} M operations, "
+        f"{paper.bytes() / rows / 1e3:.1f} kB moved at least"
+    )
     hours = [PAPER_SAMPLES * shapes * on / rows / 3600 for shapes in (100, 1000)]
     print(
         f"\nthe paper's training at that rate: {hours[0]:.2f} hours for 100 shapes, {hours[1]:.1f} for 1000"
