@@ -38,6 +38,7 @@ from sdfhub.data.sampling import Preparation
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import split
 from sdfhub.data.store import Store
+from sdfhub.model.computing import keep_freed_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "outputs" / "benchmarks" / "growth"
@@ -129,6 +130,7 @@ def draw_times(shapes: Store, *sizes: int) -> tuple[float, float]:
     Args:
         sizes: shapes a step, samples and surface points of each.
     """
+    keep_freed_memory()  # as training does
     loading = Loading(*sizes, 1, workers=0, augmentation=Augmentation(), seed=0)
     batches = StepBatches(list(shapes), loading)
     seconds = []

@@ -59,6 +59,9 @@ class Ball:
     def read(self, name: str, start: int, count: int) -> np.ndarray:
         return np.full((count, 6 if name == "surface" else 4), 0.5, np.float32)
 
+    def read_into(self, rows: np.ndarray, name: str, start: int) -> None:
+        rows[:] = 0.5
+
 
 class Shelf(dict):
     """A store of them."""

@@ -76,6 +76,9 @@ class RandomShape:
             return array[start : start + count].copy()
         return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
 
+    def read_into(self, rows: np.ndarray, name: str, start: int) -> None:
+        rows[:] = self.read(name, start, len(rows))
+
 
 class OurStep:
     """One step of what a composed config describes, without Lightning's loop around it."""

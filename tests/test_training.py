@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.data.batches import Augmentation, Loading, StepBatches, random_rows
+from sdfhub.data.batches import Augmentation, Loading, StepBatches, draw_rows
 from sdfhub.data.datamodule import EpochSteps
 from sdfhub.errors import SdfhubError
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
@@ -36,6 +36,9 @@ class FakeShape:
 
     def read(self, name: str, start: int, count: int) -> np.ndarray:
         return np.take(getattr(self, name), np.arange(start, start + count), axis=0, mode="wrap")
+
+    def read_into(self, rows: np.ndarray, name: str, start: int) -> None:
+        rows[:] = self.read(name, start, len(rows))
 
 
 def batches(shapes=5, per_step=2, samples=64, surface=16, augmentation=None, seed=0) -> StepBatches:
@@ -110,10 +113,14 @@ def test_each_group_has_its_own_learning_rate():
 def test_random_rows_reach_every_row_equally():
     shape, rng = FakeShape(0.5), np.random.default_rng(0)
     shape.inside = np.arange(10)[:, None]
-    drawn = np.concatenate([random_rows(shape, "inside", 4, rng) for _ in range(5000)])[:, 0]
-    assert np.bincount(drawn, minlength=10).std() < 60
-    assert len(random_rows(shape, "inside", 25, rng)) == 25
-    assert random_rows(shape, "inside", 0, rng).shape == (0, 1)
+    drawn = np.empty((5000, 4, 1), int)
+    for rows in drawn:
+        draw_rows(rows, shape, "inside", rng)
+    assert np.bincount(drawn.ravel(), minlength=10).std() < 60
+    more = np.full((25, 1), -1)
+    draw_rows(more, shape, "inside", rng)
+    assert np.bincount(more.ravel()).min() >= 2
+    draw_rows(more[:0], shape, "inside", rng)
 
 
 def test_a_batch_is_a_function_of_seed_and_step():

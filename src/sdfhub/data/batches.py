@@ -109,9 +109,11 @@ class StepBatches(Dataset):
 
     def __getitem__(self, step: int) -> Batch:
         rows = self.rows_of(step)
-        drawn = [self._draw(int(row), self.generator(step, row)) for row in rows]
-        samples, surface = (torch.from_numpy(np.stack(part)) for part in zip(*drawn, strict=True))
-        return batch_of(torch.from_numpy(rows), samples, surface)
+        samples = np.empty((len(rows), self.loading.samples_per_shape, 4), np.float32)
+        surface = np.empty((len(rows), self.loading.surface_per_shape, 6), np.float32)
+        for row, *of_shape in zip(rows, samples, surface, strict=True):
+            self._draw(int(row), self.generator(step, row), *of_shape)
+        return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
 
     def rows_of(self, step: int) -> np.ndarray:
         """[B] int64 rows of the code table that a step sees, of them this process's share."""
@@ -125,17 +127,16 @@ class StepBatches(Dataset):
         """What draws the samples of one row at one step."""
         return np.random.default_rng((self.loading.seed, 2, step, row))
 
-    def _draw(self, row: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
+    def _draw(self, row: int, rng: np.random.Generator, samples: np.ndarray, surface: np.ndarray) -> None:
+        """Fills samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
         copy, index = divmod(row, len(self.shapes))
         shape = self.shapes[index]
         axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
-        samples = signed_samples(shape, self.loading.samples_per_shape, rng)
-        surface = random_rows(shape, "surface", self.loading.surface_per_shape, rng)
+        draw_signed(samples, shape, rng)
+        draw_rows(surface, shape, "surface", rng)
         if copy:
             samples *= np.append(axes, scale)
             surface *= np.concatenate([axes, np.sign(axes)])
-        return samples, surface
 
 
 def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
@@ -145,9 +146,16 @@ def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -
 
 def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
     """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
-    inside = count // 2
-    sides = ("outside", count - inside), ("inside", inside)
-    return np.concatenate([random_rows(shape, name, wanted, rng) for name, wanted in sides])
+    rows = np.empty((count, 4), np.float32)
+    draw_signed(rows, shape, rng)
+    return rows
+
+
+def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> None:
+    """Fills rows [N, 4], contiguous, with what `signed_samples` returns."""
+    outside = len(rows) - len(rows) // 2
+    draw_rows(rows[:outside], shape, "outside", rng)
+    draw_rows(rows[outside:], shape, "inside", rng)
 
 
 def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
@@ -160,8 +168,8 @@ def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
         raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
 
 
-def random_rows(shape: StoredShape, name: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """`count` consecutive rows [count, C] of a shape's pre-shuffled array from a random start."""
-    refuse_empty(shape, name, count)
-    start = int(rng.integers(shape.rows(name))) if count else 0
-    return shape.read(name, start, count)
+def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
+    """Fills rows [n, C], contiguous, with consecutive ones of a pre-shuffled array from a random start."""
+    refuse_empty(shape, name, len(rows))
+    if len(rows):
+        shape.read_into(rows, name, int(rng.integers(shape.rows(name))))

@@ -172,23 +172,26 @@ class StoredShape:
 
     def read(self, name: str, start: int, count: int) -> np.ndarray:
         """`count` rows [count, C] of an array from row `start` on; after the last comes the first."""
-        if not count:
-            return np.zeros((0, COLUMNS[name]), DTYPES[name])
+        rows = np.empty((count, COLUMNS[name]), DTYPES[name])
+        self.read_into(rows, name, start)
+        return rows
+
+    def read_into(self, rows: np.ndarray, name: str, start: int) -> None:
+        """Fills `rows` [n, C], contiguous, with those of an array from row `start` on, as `read` does."""
+        if not len(rows):
+            return
         if name not in self._offsets:
             self._map(name)  # checks the header
-        rows, size = self.rows(name), COLUMNS[name] * np.dtype(DTYPES[name]).itemsize
-        parts, path = [], self.folder / f"{name}.npy"
-        while count:
-            part = min(count, rows - start)
-            try:
-                flat = np.fromfile(
-                    path, DTYPES[name], part * COLUMNS[name], offset=self._offsets[name] + start * size
-                )
-                parts.append(flat.reshape(part, COLUMNS[name]))
-            except (OSError, ValueError) as error:
-                raise self._broken(name, error) from error
-            start, count = 0, count - part
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        try:
+            with open(self.folder / f"{name}.npy", "rb") as file:
+                while len(rows):
+                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                    file.seek(self._offsets[name] + start * part.strides[0])
+                    if (found := file.readinto(part.data.cast("B"))) != part.nbytes:
+                        raise ValueError(f"{found} of {part.nbytes} bytes")
+                    start = 0
+        except (OSError, ValueError) as error:
+            raise self._broken(name, error) from error
 
     def damaged(self) -> list[str]:
         """Names of the files whose content no longer has its recorded sha256; reads all of them."""

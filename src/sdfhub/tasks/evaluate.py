@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.batches import random_rows, signed_samples
+from sdfhub.data.batches import draw_rows, signed_samples
 from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
@@ -205,8 +205,10 @@ def distance_errors(decoder: Decoder, code: Tensor, shape: StoredShape, delta: f
         samples on the right side.
     """
     rng = np.random.default_rng(0)
-    sides = [(name, min(shape.rows(name), 100_000)) for name in ("outside", "inside")]
-    drawn = np.concatenate([random_rows(shape, name, count, rng) for name, count in sides])
+    counts = {name: min(shape.rows(name), 100_000) for name in ("outside", "inside")}
+    drawn = np.empty((sum(counts.values()), 4), np.float32)
+    for part, name in zip(np.split(drawn, [counts["outside"]]), counts, strict=True):
+        draw_rows(part, shape, name, rng)
     rows = torch.from_numpy(drawn).to(code.device)
     field = torch.cat([decoder(part[None, :, :3], code[None])[0] for part in rows.split(BATCH)])
     near = rows[:, 3].abs() < delta
