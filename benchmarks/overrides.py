@@ -28,8 +28,9 @@ from lightning.pytorch import Trainer
 from sdfhub.data import store as stores
 from sdfhub.settings import flat
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.app import configuration_folder, register_resolvers
+from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
+from sdfhub.tasks.conf_files import configuration_folder
 
 VALUES = [
     *("0", "-1", "1", "2", "3", "0.5", "1e-3", "-0.5", "1e30", "1e400", "nan", "inf", "-inf", "9" * 20),

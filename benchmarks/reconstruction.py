@@ -38,9 +38,10 @@ from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import judge, point_to_surface, sample_surface
 from sdfhub.geometry.render import render
-from sdfhub.tasks.app import configuration_folder, register_resolvers
+from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
 from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
+from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.reconstruct import limits_of, reconstructor
 from sdfhub.tasks.reconstructor import Found, Reconstructor

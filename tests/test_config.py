@@ -8,8 +8,9 @@ from omegaconf import OmegaConf
 
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.app import configuration_folder, register_resolvers, run_task
+from sdfhub.tasks.app import register_resolvers, run_task
 from sdfhub.tasks.build import build, check, plain
+from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.evaluate import build_evaluation
 from sdfhub.tasks.run import build_autodecoder
 

@@ -10,7 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks import evaluate as evaluate_task
-from sdfhub.tasks.app import configuration_folder, register_resolvers
+from sdfhub.tasks.app import register_resolvers
+from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.evaluate import evaluate_run
 from sdfhub.tasks.made_with import made_with
 from sdfhub.tasks.run import begin_run

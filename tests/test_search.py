@@ -13,9 +13,9 @@ from sdfhub.locks import locked
 from sdfhub.report.results import read_sweep
 from sdfhub.settings import settings_digest
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.app import one_line, told_by_plugin
 from sdfhub.tasks.names import search_digest
 from sdfhub.tasks.search import objective
+from sdfhub.tasks.wording import one_line, told_by_plugin
 from tests.sweep_folders import score
 from tests.test_config import CONF, composed
 

@@ -16,8 +16,8 @@ from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
 from sdfhub.report.results import read_scores
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
-from sdfhub.tasks.app import one_line
 from sdfhub.tasks.build import Seed, check, plain
+from sdfhub.tasks.wording import one_line
 from sdfhub.whole_file import write_whole
 
 TASKS = ("SLURM_PROCID", "RANK")

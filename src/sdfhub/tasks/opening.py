@@ -22,8 +22,8 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.model.reconstruction import Method
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
-from sdfhub.tasks.app import configuration_folder
 from sdfhub.tasks.build import build, check
+from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.run import build_decoder, plain_frames, put_weights, read_run, read_weights
 from sdfhub.whole_file import write_whole
 

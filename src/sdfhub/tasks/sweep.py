@@ -18,9 +18,10 @@ from pydantic import PositiveInt
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
-from sdfhub.tasks.app import one_line, refuse_strangers, register_resolvers
+from sdfhub.tasks.app import refuse_strangers, register_resolvers
 from sdfhub.tasks.build import Seed, check
 from sdfhub.tasks.cells import planned_cell
+from sdfhub.tasks.wording import one_line
 
 EXTRAS = {"submitit": "slurm", "joblib": "joblib", "optuna": "optuna"}
 """What to install of sdfhub for a launcher or sweeper, by the name of its plugin."""

@@ -21,6 +21,7 @@ from torch import Tensor
 from sdfhub.data.batches import Loading
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
+from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.settings import WHERE_NOT_WHAT, flat
 from sdfhub.shapes import Frame
 from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
@@ -31,7 +32,7 @@ from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
-from sdfhub.tasks.prepare import prepare_data
+from sdfhub.tasks.prepare import Prepared, prepare_data
 from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.run import (
     begin_run,
@@ -106,28 +107,41 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         up=prepared.train[0].up,
     )
     print(f"run: {run}", flush=True)
-    trainer = parts.trainer
-    with ending_together(trainer):
+    fit(model, loader, parts)
+    if not parts.trainer.is_global_zero:
+        return {}
+    metrics = judge(model, prepared, parts, run)
+    parts.trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
+    return metrics
+
+
+def fit(model: AutoDecoder, loader: SdfDataModule, parts: Parts) -> None:
+    """Trains, from the checkpoint that the parts name, if any.
+
+    Raises:
+        SdfhubError: the samples or a piece of a batch do not fit the GPU.
+    """
+    with ending_together(parts.trainer):
         try:
-            trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+            parts.trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
         except torch.OutOfMemoryError as error:
             raise SdfhubError(
                 "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
                 "data.loader.resident=false leaves the samples on the disk"
             ) from error
-    if not trainer.is_global_zero:
-        return {}
-    training = parts.record.summary(model) | {"made_with": made_with(trainer)}
+
+
+def judge(model: AutoDecoder, prepared: Prepared, parts: Parts, run: Path) -> dict[str, Any]:
+    """What `metrics.json` holds: the training's cost and the scores of known and unseen shapes."""
+    training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
     if not parts.record.stepped:
         print(
             f"{parts.resume_from}: its training was finished (trainer.max_epochs would prolong it); judging"
         )
     known = dict(enumerate(prepared.train))
-    model.to(trainer.strategy.root_device)  # Lightning has put it back on the CPU
+    model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
     codes = model.codes.table.detach()
-    metrics = evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
-    trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
-    return metrics
+    return evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
 
 
 def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
