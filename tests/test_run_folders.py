@@ -14,8 +14,8 @@ from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.evaluate import evaluate_run
 from sdfhub.tasks.made_with import made_with
+from sdfhub.tasks.resuming import refuse_other_shapes
 from sdfhub.tasks.run import begin_run
-from sdfhub.tasks.train import refuse_other_shapes
 from tests.test_config import composed
 
 

@@ -4,7 +4,6 @@ import os
 import sys
 import warnings
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from sdfhub.data.batches import Loading
 from sdfhub.data.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.settings import WHERE_NOT_WHAT, flat
+from sdfhub.settings import flat
 from sdfhub.shapes import Frame
 from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
@@ -34,20 +33,16 @@ from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
 from sdfhub.tasks.prepare import Prepared, prepare_data
 from sdfhub.tasks.processes import ending_together
+from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 from sdfhub.tasks.run import (
     begin_run,
     build_autodecoder,
     put_weights,
-    read_run,
     read_weights,
     refuse_unwritable,
 )
 from sdfhub.tasks.search import objective
 from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
-
-FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
-"""Settings under which a run may be continued though it was started with others."""
-
 
 OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "transformer-engine")
 """What Lightning offers and we do not: pieces of a batch are differentiated without a loss scale, and the
@@ -194,44 +189,6 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
         resume_from=resume_from,
         weights=weights,
     )
-
-
-def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
-    """Refuses to continue a checkpoint under settings that its training did not have.
-
-    What may differ changes neither the model nor its data: where files lie, how a run is watched and judged,
-    and how long it lasts.
-
-    Raises:
-        SdfhubError: names every setting that differs.
-    """
-    folder = checkpoint.parent.parent
-    if not (folder / "config.yaml").is_file():
-        return
-    then, now = flat(read_run(folder)[0]), flat(config)
-    differing = [
-        f"{key}={then.get(key)} (now {now.get(key)})"
-        for key in sorted(then | now)
-        if then.get(key) != now.get(key) and not key.startswith(FREE_TO_CHANGE)
-    ]
-    if differing:
-        raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
-
-
-def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
-    """Refuses to continue a checkpoint where its source now offers other shapes: a code is known by its row.
-
-    Raises:
-        SdfhubError: names the first row that differs.
-    """
-    folder = checkpoint.parent.parent
-    then = read_run(folder)[1]["train"] if (folder / "split.json").is_file() else ids
-    for row, (before, now) in enumerate(zip_longest(then, ids)):
-        if before != now:
-            raise SdfhubError(
-                f"ckpt_path={checkpoint}: the shapes that data= offers have changed: code {row} is that of "
-                f"{before or 'none'}, now it would be that of {now or 'none'}; bring them back, or train anew"
-            )
 
 
 def refuse_missing_normals(data: dict[str, Any]) -> None:
