@@ -54,7 +54,7 @@ def main() -> None:
 def judged(cell: Cell, score: ShapeScore, truth) -> tuple | None:
     """Id, excess, two asymmetries, strays, share of these in the mirror; None without truth or mesh."""
     shape = truth(cell, score.id)
-    mesh = reconstruction(cell, "known", score, shape) if shape else None
+    mesh = reconstruction(cell.folder, "known", score, shape) if shape else None
     if mesh is None:
         return None
     surface = np.array(shape.surface[:POINTS, :3])

@@ -15,12 +15,13 @@ import yaml
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report.claims import verdicts
+from sdfhub.report.drawings import packed
 from sdfhub.report.formats import csv_text, latex, markdown, shapes_csv
 from sdfhub.report.meshes import Mesh, reconstruction
 from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
 from sdfhub.report.paper import CLAIMS, COSTS, PRINTED
-from sdfhub.report.pictures import Gallery, packed
+from sdfhub.report.pictures import Gallery
 from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import estimate, group_cells
@@ -166,9 +167,9 @@ def test_a_shapes_id_cannot_point_out_of_its_folder(tmp_path):
     (cell,) = read_sweep(tmp_path / "s")
     shape = cell.scores.shapes["known"][0]
     write_mesh(folder, "chairs/0000")
-    assert reconstruction(cell, "known", shape, None) is not None
+    assert reconstruction(cell.folder, "known", shape, None) is not None
     strange = shape.model_copy(update={"id": str(outside.with_suffix(""))})
-    assert reconstruction(cell, "known", strange, None) is None
+    assert reconstruction(cell.folder, "known", strange, None) is None
 
 
 def test_names_and_reasons_are_text_in_every_format(tmp_path):

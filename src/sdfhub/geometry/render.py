@@ -128,12 +128,20 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
     if len(faces) > _SMOOTH_FACES:
         smooth = flat
     else:
-        corners = _corner_normals(faces, cross, of_face)[face]
+        corners = _corner_normals_of(face, faces, cross, of_face)
         u, v = hits["u"][seen, None], hits["v"][seen, None]
         smooth = _unit((1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2])
     away = np.einsum("ij,ij->i", flat, directions) > 0
     sign = np.where(away, -1.0, 1.0)[:, None]
     return smooth * sign, flat * sign
+
+
+def _corner_normals_of(seen: np.ndarray, faces, cross, of_face) -> np.ndarray:
+    """[N, 3, 3] unit normals at the corners of the faces `seen` [N], from those around them alone."""
+    touched = np.zeros(faces.max() + 1, bool)
+    touched[faces[seen]] = True
+    near = touched[faces].any(axis=1)
+    return _corner_normals(faces[near], cross[near], of_face[near])[np.cumsum(near)[seen] - 1]
 
 
 def _corner_normals(faces: np.ndarray, cross: np.ndarray, of_face: np.ndarray) -> np.ndarray:

@@ -37,12 +37,12 @@ def true_mesh(truth: StoredShape | None) -> Mesh | None:
     return Mesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
 
 
-def reconstruction(cell: Cell, role: str, score: ShapeScore, truth: StoredShape | None) -> Mesh | None:
-    """A cell's reconstruction of a shape in the normalised frame; None where there is no surface.
+def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> Mesh | None:
+    """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
 
     Where the truth is not there to say what the frame was, the mesh's own extent does.
     """
-    folder = cell.folder / "meshes" / role
+    folder = cell / "meshes" / role
     path = folder / f"{score.id}.ply"
     if score.failed or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
         return None

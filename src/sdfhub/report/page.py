@@ -5,18 +5,22 @@ import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
+from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from sdfhub.report.charts import Series, line_chart, strip_chart
 from sdfhub.report.claims import Verdict, verdicts
-from sdfhub.report.curves import curve
+from sdfhub.report.curves import curves_of
 from sdfhub.report.origin import installed_version
 from sdfhub.report.pictures import Gallery, Sheet, data_uri
 from sdfhub.report.results import Cell
 from sdfhub.report.rows import Group, Row
 from sdfhub.report.tables import Table, overview, tables
+
+Curves = dict[Path, list[tuple[int, float]]]
+"""Points of the curve of each run."""
 
 COLOURS = 8
 
@@ -52,11 +56,16 @@ def page(
         gallery: draws shapes.
         shapes: on a contact sheet.
     """
+    turning = [gallery.turning(group, min(shapes, TO_TURN), MESH_BYTES // len(groups)) for group in groups]
+    sheets = [(gallery.sheet(group, shapes), gallery.extremes(group)) for group in groups]
+    gallery.draw()
+    curves = curves_of([cell.folder for group in groups for row in group.rows for cell in row.done])
     meshes, parts = [], []
-    for group in groups:
-        turning = gallery.turning(group, min(shapes, TO_TURN), MESH_BYTES // len(groups))
-        parts.append(_part(group, gallery, shapes, len(meshes) if turning else None))
-        meshes += [turning] if turning else []
+    for group, to_turn, pictures in zip(groups, turning, sheets, strict=True):
+        found = [{"name": shape.name, "role": shape.role, "panels": shape.panels()} for shape in to_turn]
+        found = [shape for shape in found if shape["panels"]]
+        parts.append(_part(group, curves, *pictures, len(meshes) if found else None))
+        meshes += [found] if found else []
     script = _text("viewer.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return _template().render(
@@ -74,7 +83,7 @@ def page(
     )
 
 
-def _part(group: Group, gallery: Gallery, shapes: int, meshes: int | None) -> Part:
+def _part(group: Group, curves: Curves, sheet: Sheet, extremes: Sheet, meshes: int | None) -> Part:
     colours = {method: k % COLOURS for k, method in enumerate(dict.fromkeys(r.method for r in group.rows))}
     found = tables(group)
     return Part(
@@ -82,21 +91,21 @@ def _part(group: Group, gallery: Gallery, shapes: int, meshes: int | None) -> Pa
         tables=found,
         missing=[row for table in found if table.head[0] == "cell" for row in table.rows],
         verdicts=verdicts(group),
-        charts=_charts(group, colours),
+        charts=_charts(group, curves, colours),
         legend=[(row.label, colours[row.method], row.normals != "on") for row in group.rows if row.done],
-        sheet=gallery.sheet(group, shapes),
-        extremes=gallery.extremes(group),
+        sheet=sheet,
+        extremes=extremes,
         meshes=meshes,
     )
 
 
-def _charts(group: Group, colours: dict[str, int]) -> list[tuple[str, Markup]]:
+def _charts(group: Group, curves: Curves, colours: dict[str, int]) -> list[tuple[str, Markup]]:
     def series(row: Row, values: list) -> Series:
         return Series(row.label, colours[row.method], row.normals != "on", values)
 
-    curves = [series(row, curve(cell.folder)) for row in group.rows for cell in row.done]
+    lines = [series(row, curves[cell.folder]) for row in group.rows for cell in row.done]
     found = [
-        ("Loss of signed distances while training, a line a seed", line_chart(curves, "step", "clamped L1"))
+        ("Loss of signed distances while training, a line a seed", line_chart(lines, "step", "clamped L1"))
     ]
     for role, words in (("known", "known"), ("held_out", "held-out")):
         rows = [series(row, _distances(row, role)) for row in group.rows if row.done]

@@ -2,22 +2,23 @@
 
 import base64
 import io
+import os
 from dataclasses import dataclass, field
 
-import fast_simplification
 import numpy as np
 from PIL import Image
 
-from sdfhub.geometry.render import render
-from sdfhub.report.meshes import FindTruth, Mesh, reconstruction, true_mesh
+from sdfhub.data.workers import stream_in_processes
+from sdfhub.report.drawings import Drawing, Subject, drawn
+from sdfhub.report.meshes import FindTruth
 from sdfhub.report.results import ROLES, ShapeScore
 from sdfhub.report.rows import Group, Row
 
-PIXELS, PAPER = 208, 0.955
-"""Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
-
 FEWEST, MOST = 400, 4000
 """Triangles of a mesh to turn."""
+
+A_WORKERS_WORTH = 16
+"""Meshes that take about as long as the start of a process that draws them."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,40 @@ class Tile:
     """One picture.
 
     Args:
-        image: [S, S, 3] uint8; None where there is no surface or no file.
+        drawing: what is seen; None where there is nothing to draw.
         caption: below it.
         alt: what stands in the place of a picture that is not there.
     """
 
-    image: np.ndarray | None
+    drawing: Drawing | None
     caption: str
     alt: str
+
+    @property
+    def image(self) -> np.ndarray | None:
+        """[S, S, 3] uint8; None where there is no surface or no file, and until it is drawn."""
+        return self.drawing and self.drawing.image
+
+
+@dataclass(frozen=True)
+class Turning:
+    """One shape to turn under the mouse: the truth and each row, by label.
+
+    Args:
+        name, role: of the shape.
+        drawings: by label.
+        triangles: of each, at most.
+    """
+
+    name: str
+    role: str
+    drawings: list[tuple[str, Drawing]]
+    triangles: int
+
+    def panels(self) -> list[dict]:
+        """The packed meshes of those that have one, for the viewer of the page."""
+        packs = [(label, drawing.packs.get(self.triangles)) for label, drawing in self.drawings]
+        return [{"label": label} | pack for label, pack in packs if pack]
 
 
 @dataclass(frozen=True)
@@ -45,22 +72,31 @@ class Sheet:
 
 @dataclass
 class Gallery:
-    """Renders and packs meshes, each once.
+    """Says what is to be drawn, and then draws each mesh once.
 
     Args:
         find_truth: prepared shapes by cell and id.
     """
 
     find_truth: FindTruth
-    _images: dict[tuple, np.ndarray | None] = field(default_factory=dict)
+    _drawings: dict[tuple, Drawing] = field(default_factory=dict)
+
+    def draw(self) -> None:
+        """Draws what was asked for since the last time, in as many processes as it is worth."""
+        left = [drawing for drawing in self._drawings.values() if not drawing.done]
+        workers = min(os.cpu_count() or 1, len(left) // A_WORKERS_WORTH)
+        asked = [drawing.asked for drawing in left]
+        for drawing, found in zip(left, stream_in_processes(drawn, asked, workers), strict=True):
+            drawing.image, drawing.packs = found
+            drawing.done = True
 
     def sheet(self, group: Group, count: int) -> Sheet:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
         columns = [f"{id} ({'known' if role == 'known' else 'held out'})" for role, id in shown]
         first = _first_done(group)
-        truth = [Tile(self._truth_image(first, id), "", "no truth") for _, id in shown]
-        rows = [("Ground truth", truth)] if any(tile.image is not None for tile in truth) else []
+        truth = [self._truth_tile(first, id, "") for _, id in shown]
+        rows = [("Ground truth", truth)] if any(tile.drawing for tile in truth) else []
         for row in group.rows:
             absent = Tile(
                 None, "", "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
@@ -83,8 +119,8 @@ class Gallery:
                 rows.append((row.label, tiles))
         return Sheet(columns, rows)
 
-    def turning(self, group: Group, count: int, budget: int) -> list[dict]:
-        """Decimated meshes of some shapes, truth and rows, packed for the viewer of the page.
+    def turning(self, group: Group, count: int, budget: int) -> list[Turning]:
+        """Some shapes, truth and rows, decimated for the viewer of the page.
 
         Args:
             group: whose.
@@ -97,37 +133,42 @@ class Gallery:
         triangles = min(MOST, max(FEWEST, triangles))
         found = []
         for role, id in shown:
-            meshes = [("Ground truth", true_mesh(self.find_truth(rows[0].done[0], id)))]
-            meshes += [(row.label, self._mesh(row, role, id)) for row in rows]
-            panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes if mesh]
-            if panels:
-                found.append({"name": id, "role": role.replace("_", " "), "panels": panels})
+            drawings = [("Ground truth", self._truth(rows[0], id))]
+            for row in rows:
+                score = _score(row, role, id)
+                drawings.append((row.label, score and self._reconstruction(row, role, score)))
+            there = [(label, drawing.packed(triangles)) for label, drawing in drawings if drawing]
+            found.append(Turning(id, role.replace("_", " "), there, triangles))
         return found
 
     def _pair(self, row: Row, shape: ShapeScore) -> list[Tile]:
-        truth = Tile(self._truth_image(row, shape.id), shape.id, "no truth")
-        return [truth, self._tile(row, "known", shape.id)]
+        return [self._truth_tile(row, shape.id, shape.id), self._tile(row, "known", shape.id)]
 
     def _tile(self, row: Row, role: str, id: str) -> Tile:
         score = _score(row, role, id)
         if score is None:
             return Tile(None, "", "not judged")
-        key = (row.done[0].folder, role, id)
-        if key not in self._images:
-            self._images[key] = picture(self._mesh(row, role, id))
         caption = "no surface" if score.failed else f"CD {score.counted_cd * 1e3:.3f}"
-        return Tile(self._images[key], caption, "no surface" if score.failed else "no mesh")
+        alt = "no surface" if score.failed else "no mesh"
+        return Tile(self._reconstruction(row, role, score).pictured(), caption, alt)
 
-    def _truth_image(self, row: Row, id: str) -> np.ndarray | None:
+    def _reconstruction(self, row: Row, role: str, score: ShapeScore) -> Drawing:
+        folder = row.done[0].folder
+        key = (folder, role, score.id)
+        if key not in self._drawings:
+            truth = self.find_truth(row.done[0], score.id)
+            self._drawings[key] = Drawing(Subject(truth, folder, role, score))
+        return self._drawings[key]
+
+    def _truth(self, row: Row, id: str) -> Drawing | None:
         truth = self.find_truth(row.done[0], id)
-        key = truth and ("truth", truth.folder)
-        if key not in self._images:
-            self._images[key] = picture(true_mesh(truth))
-        return self._images[key]
+        if truth is None or not truth.rows("faces"):
+            return None
+        return self._drawings.setdefault(("truth", truth.folder), Drawing(Subject(truth)))
 
-    def _mesh(self, row: Row, role: str, id: str) -> Mesh | None:
-        score = _score(row, role, id)
-        return reconstruction(row.done[0], role, score, self.find_truth(row.done[0], id)) if score else None
+    def _truth_tile(self, row: Row, id: str, caption: str) -> Tile:
+        truth = self._truth(row, id)
+        return Tile(truth and truth.pictured(), caption, "no truth")
 
 
 def _score(row: Row, role: str, id: str) -> ShapeScore | None:
@@ -150,32 +191,8 @@ def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     return [("known", id) for id in known] + [("held_out", id) for id in unseen]
 
 
-def picture(mesh: Mesh | None) -> np.ndarray | None:
-    """A mesh from the usual side, [S, S, 3] uint8; None without a mesh."""
-    return mesh and render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
-
-
 def data_uri(image: np.ndarray) -> str:
     """A picture as a WebP data URI."""
     content = io.BytesIO()
     Image.fromarray(image).save(content, "WEBP", quality=82)
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
-
-
-def packed(mesh: Mesh, triangles: int) -> dict[str, int | str]:
-    """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
-
-    Returns:
-        `vertices` and `faces`: counts; `data`: positions times 32767 (int16), then indices (uint16).
-    """
-    vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
-    if len(faces) > triangles:
-        vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))
-    if len(vertices) > 65_535:  # many loose triangles do not decimate
-        faces = faces[(faces < 65_535).all(axis=1)]
-        vertices = vertices[:65_535]
-    if mesh.up == "y":
-        vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
-    places = (np.clip(vertices, -1, 1) * 32767).astype("<i2").tobytes()
-    data = base64.b64encode(places + np.asarray(faces).astype("<u2").tobytes()).decode()
-    return {"vertices": len(vertices), "faces": len(faces), "data": data}

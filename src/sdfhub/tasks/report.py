@@ -52,9 +52,10 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     write_whole(out / "table.csv", csv_text(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
     gallery = Gallery(truth_finder())
+    whole_page = page(sweep.name, cells, groups, origin, gallery, shapes)
     for group in groups:
         write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
-    write_whole(out / "report.html", page(sweep.name, cells, groups, origin, gallery, shapes))
+    write_whole(out / "report.html", whole_page)
     print(f"report: {out / 'report.html'}", flush=True)
     return cells
 
