@@ -281,6 +281,7 @@ def test_a_sweep_that_is_not_there_is_answered_with_those_that_are(trainer, monk
 REFUSED = {
     "sweeps=smoke,table_small": "sweeps=smoke,table_small: takes one name",
     "+foo=3": "there is no group or key 'foo'",
+    "+foo=3,4": "there is no group or key 'foo'",
     "~data.held_out": "data.held_out: is needed",
     "experiment=siren,sirenn": "did you mean 'siren'?",
     'hydra.sweeper.params.experiment="fft_siren,hosk"': "Could not find 'experiment/hosk' Available options",

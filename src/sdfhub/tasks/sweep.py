@@ -155,9 +155,15 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
 
     Args:
         config: of the multirun, Hydra's own part included.
+
+    Raises:
+        SdfhubError: a key that nothing reads, or a seed that is none.
     """
     loader = GlobalHydra.instance().config_loader()
-    return [as_planned(loader.load_sweep_config(config, job)) for job in jobs(config)]
+    cells = [loader.load_sweep_config(config, job) for job in jobs(config)]
+    for cell in cells[:1]:  # all have the same keys
+        refuse_strangers(cell, cell.hydra.job.config_name, cell.hydra)
+    return [as_planned(cell) for cell in cells]
 
 
 def jobs(config: DictConfig) -> list[list[str]]:
