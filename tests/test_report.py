@@ -14,6 +14,7 @@ import yaml
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
+from sdfhub.report import curves, pictures
 from sdfhub.report.claims import verdicts
 from sdfhub.report.drawings import packed
 from sdfhub.report.formats import csv_text, latex, markdown, shapes_csv
@@ -387,6 +388,18 @@ def test_packed_meshes_unpack_to_the_same_places_within_a_step():
     np.testing.assert_allclose(places, turned, atol=1e-4)
     np.testing.assert_array_equal(faces, mesh.faces)
     assert packed(mesh, triangles=100)["faces"] <= 110
+
+
+def test_other_processes_draw_and_read_the_same(small, monkeypatch):
+    """The plain twin of drawing in processes is drawing here."""
+    for cell in read_sweep(small):
+        write_mesh(cell.folder, "chairs/0000")
+    found = []
+    for worth in (1000, 1):
+        monkeypatch.setattr(pictures, "A_WORKERS_WORTH", worth)
+        monkeypatch.setattr(curves, "A_WORKERS_WORTH", worth)
+        found.append(re.sub("20[0-9-]+ [0-9:]+ UTC", "", page_of(small)))
+    assert found[0] == found[1] and "data:image/webp" in found[0]
 
 
 def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monkeypatch, tmp_path, capsys):
