@@ -125,3 +125,10 @@ def test_a_mesh_with_y_up_is_turned_upright():
     assert np.array_equal(render(high, ball.faces, 64, up="y"), render(standing, ball.faces, 64))
     rows = np.flatnonzero((render(high, ball.faces, 64, up="y") < 250).any(axis=(1, 2)))
     assert rows.max() < 40
+
+
+@pytest.mark.parametrize("size, place", [(1e-5, 0.0), (0.1, 50.0), (0.0, 0.2)])
+def test_what_no_ray_hits_leaves_the_background(size, place, ball):
+    """A crumb, a mesh out of view, and one without area."""
+    image = render(ball.vertices * size + place, ball.faces, 32)
+    assert (image == 255).all()

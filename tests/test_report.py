@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 import yaml
+from torch.utils.tensorboard import SummaryWriter
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
@@ -394,12 +395,16 @@ def test_other_processes_draw_and_read_the_same(small, monkeypatch):
     """The plain twin of drawing in processes is drawing here."""
     for cell in read_sweep(small):
         write_mesh(cell.folder, "chairs/0000")
+        with SummaryWriter(cell.folder / "tensorboard") as writer:
+            for step in range(9):
+                writer.add_scalar("loss/sdf", 0.1 / (1 + step + cell.plan.seed), step)
     found = []
     for worth in (1000, 1):
         monkeypatch.setattr(pictures, "A_WORKERS_WORTH", worth)
         monkeypatch.setattr(curves, "A_WORKERS_WORTH", worth)
         found.append(re.sub("20[0-9-]+ [0-9:]+ UTC", "", page_of(small)))
-    assert found[0] == found[1] and "data:image/webp" in found[0]
+    assert found[0] == found[1]
+    assert "data:image/webp" in found[0] and "Loss of signed distances" in found[0]
 
 
 def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monkeypatch, tmp_path, capsys):

@@ -257,7 +257,13 @@ def test_rows_read_from_disk_are_those_of_the_map_and_leave_nothing_open(tmp_pat
     for shape in fill(tmp_path, Balls(2)):
         for name in ("outside", "inside", "surface"):
             array = np.array(getattr(shape, name))
-            for start, count in ((0, 5), (len(array) - 3, 7), (2, 2 * len(array) + 1), (1, 0)):
+            for start, count in (
+                (0, 5),
+                (len(array) - 3, 7),
+                (2, 2 * len(array) + 1),
+                (1, 0),
+                (len(array), 2),
+            ):
                 wanted = np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
                 assert np.array_equal(shape.read(name, start, count), wanted)
     assert not [f for f in os.listdir("/proc/self/fd") if _is_shard(f)]

@@ -110,7 +110,7 @@ def test_each_group_has_its_own_learning_rate():
     }
 
 
-def test_random_rows_reach_every_row_equally():
+def test_drawn_rows_reach_every_row_equally():
     shape, rng = FakeShape(0.5), np.random.default_rng(0)
     shape.inside = np.arange(10)[:, None]
     drawn = np.empty((5000, 4, 1), int)

@@ -116,10 +116,10 @@ def _put_in_place(beside: Path, folder: Path) -> None:
 
 
 class StoredShape:
-    """One prepared shape; its arrays are mapped when asked for, not read, and `read` opens no map.
+    """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
-    Training draws by `read`: a map costs 0.2 ms to open, and the pages touched through maps that stay open
-    would count as this process's memory until they were the whole store.
+    Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
+    open would count as this process's memory until they were the whole store.
 
     Attributes:
         id, category, fingerprint, credits: as the source gave them.
@@ -182,6 +182,7 @@ class StoredShape:
             return
         if name not in self._offsets:
             self._map(name)  # checks the header
+        start %= self.rows(name)
         try:
             with open(self.folder / f"{name}.npy", "rb") as file:
                 while len(rows):

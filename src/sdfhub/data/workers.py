@@ -72,6 +72,12 @@ def stream_in_processes(function: Callable, items: Iterable, workers: int) -> It
         pool.shutdown(wait=False, cancel_futures=True)
 
 
+def workers_worth(items: int, each: int) -> int:
+    """Worker processes for so many items where one pays for `each`; 0, for none, where it would be one."""
+    workers = min(os.cpu_count() or 1, items // each)
+    return workers if workers > 1 else 0
+
+
 def _submitted(pool: ProcessPoolExecutor, function: Callable, item: object) -> Future | None:
     try:
         with _startable(function):
@@ -115,7 +121,7 @@ def _pool(workers: int, function: Callable) -> ProcessPoolExecutor:
         # a worker of joblib's starts processes in a way of its own, which ours would be told to take up
         multiprocessing.set_start_method(context.get_start_method(), force=True)
     if context.get_start_method() == "forkserver":  # imports once what each worker would import
-        context.set_forkserver_preload([type(function).__module__])
+        context.set_forkserver_preload([function.__module__])
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(function,))
 
 

@@ -125,7 +125,7 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
     of_face = _unit(cross)
     face = hits["primID"][seen]
     flat = of_face[face]
-    if len(faces) > _SMOOTH_FACES:
+    if len(faces) > _SMOOTH_FACES or not len(face):
         smooth = flat
     else:
         corners = _corner_normals_of(face, faces, cross, of_face)

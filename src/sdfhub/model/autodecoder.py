@@ -55,13 +55,14 @@ class AutoDecoder(L.LightningModule):
         return self.decoder(points, self.codes(rows))
 
     def on_fit_start(self) -> None:
-        self.computing.set_up(self.device)
         self.decoder.encoding = self.computing.quickest(self.decoder.encoding, self.device)
+        self.computing.set_up(self.device)
         passes = self.decoder.forward, self.decoder.value_and_gradient
         self._value, self._value_and_gradient = self.computing.compiled(*passes, device=self.device)
 
     def on_fit_end(self) -> None:
-        self.decoder.encoding = self.decoder.encoding.plain()
+        # Lightning has moved the model to the CPU by now, and of the plain encoding its weights alone
+        self.decoder.encoding = self.decoder.encoding.plain().to(self.device)
         self.computing.put_back()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:

@@ -14,11 +14,16 @@ import torch._functorch.config as aot
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.encodings import Encoding
-from sdfhub.model.fused_hash import fused
+from sdfhub.model.fused_hash import can_fuse, fused
 
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 """Samples worked on together: what stays in a CPU's caches; what fills a GPU and not its memory."""
 
+
+_NO_TWIN = (
+    "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
+    "tiny-cuda-nn built for it; null takes it where it is there"
+)
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of options in glibc's malloc.h
 
@@ -31,8 +36,9 @@ class Computing:
         points_at_once: samples that go through the decoder together, >= 1; bounds memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
             None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
-        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result. None: on a
-            GPU, where it is installed and agrees.
+        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result but for
+            rounding: it adds up a table's gradient in any order. None: on a GPU, where it is installed and
+            agrees, and no deterministic algorithms are asked for.
         matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
             (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
     """
@@ -64,17 +70,25 @@ class Computing:
         """The encoding, or its twin by tiny-cuda-nn.
 
         Raises:
-            SdfhubError: the twin was asked for, and there is none here.
+            SdfhubError: the twin was asked for, and there is none here that agrees.
         """
-        if self.tinycudann is False:
+        self.refuse_impossible(encoding, device)
+        exact = self.tinycudann is None and torch.are_deterministic_algorithms_enabled()
+        if self.tinycudann is False or exact or not can_fuse(encoding, device):
             return encoding
-        twin = fused(encoding, device)
+        twin = fused(encoding)
         if self.tinycudann and twin is encoding:
-            raise SdfhubError(
-                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, "
-                "and tiny-cuda-nn built for it; null takes it where it is there"
-            )
+            raise SdfhubError(_NO_TWIN)
         return twin
+
+    def refuse_impossible(self, encoding: Encoding, device: torch.device) -> None:
+        """Refuses to train by what is not there, before anything is prepared.
+
+        Raises:
+            SdfhubError: tiny-cuda-nn was asked for, where it cannot be.
+        """
+        if self.tinycudann and not can_fuse(encoding, device):
+            raise SdfhubError(_NO_TWIN)
 
     def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
         """The functions themselves, or what `torch.compile` makes of them on this device.

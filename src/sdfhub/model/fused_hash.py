@@ -71,6 +71,7 @@ class FusedHash(Encoding):
 
     @torch.compiler.disable
     def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        """As `Hash`, for training: without gradients the pullback serves once."""
         places = points if points.requires_grad else points.detach().requires_grad_()
         with torch.enable_grad():
             features = self(places)
@@ -84,11 +85,14 @@ class FusedHash(Encoding):
         return features, pullback
 
 
-def fused(plain: Encoding, device: torch.device) -> Encoding:
-    """The twin of a hash encoding on this device, or the encoding itself where there is none that agrees."""
-    fits = isinstance(plain, Hash) and plain.width in WIDTHS and device.type == "cuda"
-    if not fits or find_spec("tinycudann") is None:
-        return plain
+def can_fuse(encoding: Encoding, device: torch.device) -> bool:
+    """Whether there could be a twin on this device."""
+    fits = isinstance(encoding, Hash) and encoding.width in WIDTHS and device.type == "cuda"
+    return fits and find_spec("tinycudann") is not None
+
+
+def fused(plain: Hash) -> Encoding:
+    """The twin of a hash encoding, or the encoding itself where the library fails or disagrees."""
     try:
         twin = FusedHash(plain)
         difference = disagreement(twin, plain)

@@ -1,22 +1,21 @@
 """Training curves, from the event files that every run keeps for TensorBoard."""
 
-import os
 from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sdfhub.data.workers import stream_in_processes
+from sdfhub.data.workers import stream_in_processes, workers_worth
 
 KEEP = {"scalars": 0, "images": 1, "audio": 1, "histograms": 1, "tensors": 1}
 """Of each tag; 0 keeps all. Pictures and meshes are in the same files and not wanted."""
 
 A_WORKERS_WORTH = 16
-"""Runs that take about as long as the start of a process that reads them."""
+"""Runs for which it pays to start a process that reads them."""
 
 
 def curves_of(runs: list[Path]) -> dict[Path, list[tuple[int, float]]]:
     """The `curve` of each run, read in as many processes as it is worth: their files are parsed in Python."""
-    workers = min(os.cpu_count() or 1, len(runs) // A_WORKERS_WORTH)
+    workers = workers_worth(len(runs), A_WORKERS_WORTH)
     return dict(zip(runs, stream_in_processes(curve, runs, workers), strict=True))
 
 

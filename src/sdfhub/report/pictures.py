@@ -2,13 +2,12 @@
 
 import base64
 import io
-import os
 from dataclasses import dataclass, field
 
 import numpy as np
 from PIL import Image
 
-from sdfhub.data.workers import stream_in_processes
+from sdfhub.data.workers import stream_in_processes, workers_worth
 from sdfhub.report.drawings import Drawing, Subject, drawn
 from sdfhub.report.meshes import FindTruth
 from sdfhub.report.results import ROLES, ShapeScore
@@ -17,8 +16,8 @@ from sdfhub.report.rows import Group, Row
 FEWEST, MOST = 400, 4000
 """Triangles of a mesh to turn."""
 
-A_WORKERS_WORTH = 16
-"""Meshes that take about as long as the start of a process that draws them."""
+A_WORKERS_WORTH = 32
+"""Meshes for which it pays to start a process that draws them."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Gallery:
     def draw(self) -> None:
         """Draws what was asked for since the last time, in as many processes as it is worth."""
         left = [drawing for drawing in self._drawings.values() if not drawing.done]
-        workers = min(os.cpu_count() or 1, len(left) // A_WORKERS_WORTH)
+        workers = workers_worth(len(left), A_WORKERS_WORTH)
         asked = [drawing.asked for drawing in left]
         for drawing, found in zip(left, stream_in_processes(drawn, asked, workers), strict=True):
             drawing.image, drawing.packs = found

@@ -8,6 +8,7 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
+from torch import Tensor
 
 from sdfhub.data.shards import StoredShape
 from sdfhub.errors import SdfhubError
@@ -32,8 +33,8 @@ class TrainingRecord(L.Callback):
     """Steps averaged at either end."""
 
     def __init__(self):
-        self._first: list[float] = []
-        self._last: deque[float] = deque(maxlen=self.ENDS)
+        self._first: list[float | Tensor] = []  # numbers once they are needed: a GPU would be waited for
+        self._last: deque[float | Tensor] = deque(maxlen=self.ENDS)
         self._seconds = 0.0  # of all processes before this one; then, once training ends, of all
         self._started: float | None = None
         self._trainer: L.Trainer | None = None
@@ -45,10 +46,9 @@ class TrainingRecord(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
         if not self.stepped:
             self.stepped, self._started = True, time.perf_counter()
-        loss = float(outputs["loss"])
-        self._last.append(loss)
+        self._last.append(outputs["loss"])
         if len(self._first) < self.ENDS:
-            self._first.append(loss)
+            self._first.append(outputs["loss"])
 
     def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
         self._seconds, self._started = self._so_far(), None
@@ -60,7 +60,8 @@ class TrainingRecord(L.Callback):
         return self._seconds + time.perf_counter() - self._started - watching
 
     def state_dict(self) -> dict:
-        return {"seconds": self._so_far(), "first": list(self._first), "last": list(self._last)}
+        ends = {"first": self._first, "last": self._last}
+        return {"seconds": self._so_far()} | {end: [float(loss) for loss in ends[end]] for end in ends}
 
     def load_state_dict(self, state: dict) -> None:
         self._seconds, self._first = float(state["seconds"]), [float(loss) for loss in state["first"]]
@@ -68,7 +69,8 @@ class TrainingRecord(L.Callback):
 
     def summary(self, model: AutoDecoder) -> dict:
         """Plain numbers: seconds without `MeshShapes` and steps of the whole run, parameters, loss."""
-        mean = {"start": np.mean(self._first), "end": np.mean(self._last)} if self._last else {}
+        state = self.state_dict()
+        mean = {"start": np.mean(state["first"]), "end": np.mean(state["last"])} if self._last else {}
         return {
             "seconds": self._seconds,
             "steps": model.global_step,

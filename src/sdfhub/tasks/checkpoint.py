@@ -97,7 +97,7 @@ class KeepLast(L.Callback):
 def checkpointing(folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None) -> list[L.Callback]:
     """`last.ckpt`, the newest state, and on demand snapshots `epoch_0500.ckpt` that stay.
 
-    A run continued from any of them is exact.
+    A run continued from any of them is exact; on a GPU up to rounding, where its kernels add in any order.
 
     Args:
         folder: where they lie.

@@ -181,10 +181,12 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     watched = bar and sys.stdout.isatty()
     if bar:  # in a file a bar is ten thousand lines
         callbacks.append(LossBar() if watched else LossLines())
+    trainer = build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks)
+    model.computing.refuse_impossible(model.decoder.encoding, trainer.strategy.root_device)
     return Parts(
         evaluation=build_evaluation(config["evaluate"], config["loss"]),
         loading=build(config["data"]["loader"], "data.loader"),
-        trainer=build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks),
+        trainer=trainer,
         record=record,
         resume_from=resume_from,
         weights=weights,

@@ -76,6 +76,7 @@ def _told_by(path: Path) -> str:
 
 
 def no_such_key(key: str, config_name: str = "config") -> str:
+    """That there is no such key, and which one may have been meant."""
     group, _, below = key.partition(".")
     groups = group_names()
     if group == "hydra":
