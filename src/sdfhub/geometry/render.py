@@ -56,7 +56,7 @@ def render(
         if up == "y":
             vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
         scene = EmbreeScene()
-        TriangleMesh(scene, vertices[faces].astype(np.float32))
+        TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
         origins, directions = _camera_rays(2 * size, azimuth, elevation)
         hits = scene.run(origins, directions, query="INTERSECT", output=1)
         seen = np.flatnonzero(hits["primID"] >= 0)
