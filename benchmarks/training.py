@@ -219,7 +219,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
                 shapes, args.samples, surface, ["activation=siren", *paper], bf16, device
             ),
         }
-    made |= hash_steps(shapes, args, device) if device.type == "cuda" else {}
+    made |= hash_steps(shapes, args, device)
     fields = {
         "decoder=deepsdf": deepsdf,
         "paper_585k, HOSC": paper,
@@ -232,7 +232,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
 def hash_steps(
     shapes: list[RandomShape], args: argparse.Namespace, device: torch.device
 ) -> dict[str, object]:
-    """Steps with a hash encoding in bfloat16, by each of the ways to compute it that there are here."""
+    """Steps with a hash encoding, by each of the ways to compute it that there are here."""
     ways = {"tensor operations": "false"} | ({"tiny-cuda-nn": "true"} if find_spec("tinycudann") else {})
     choice = ["decoder=paper_585k", "encoding=hash", *args.overrides]
     return {
