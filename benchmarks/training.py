@@ -258,6 +258,7 @@ def main() -> None:
         torch.set_num_threads(args.threads)
     register_resolvers()
     keep_freed_memory()  # for the reference too
+    torch._dynamo.config.recompile_limit = 64  # each decoder is a version; else late ones run plain
     torch.manual_seed(0)
     with (
         tempfile.TemporaryDirectory() as folder,
