@@ -11,7 +11,7 @@ crumb, which rounding decides about, makes a mean and leaves the median.
 import argparse
 import statistics
 
-from runs import train
+from runs import at_least, run_benchmark, train
 
 PRECISIONS = ("32-true", "bf16-mixed")
 STATISTICS = ("mean", "median")
@@ -21,7 +21,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=at_least(1), default=3)
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
     common = ["scale=demo", "experiment=fft_hosc", "callbacks=none", "data.held_out=0", *args.overrides]
@@ -45,4 +45,4 @@ def line(name: str, values: list[float]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from runs import ROOT
+from runs import ROOT, at_least, run_benchmark
 
 from sdfhub.data.normalize import normalize_mesh
 from sdfhub.data.preparation import DEFAULT
@@ -30,6 +30,7 @@ from sdfhub.data.procedural import generate
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.metrics import Judge, Mesh, chamfer, sample_surface
 from sdfhub.shapes import NormalizedMesh
+from sdfhub.tasks.run import read_run
 
 FACES = 50_000
 """A twin is split until it has more."""
@@ -95,12 +96,16 @@ def line(name: str, shapes: int, seconds: float, processor: float | None = None)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--chamfer", type=int, default=1000, help="chairs for the Chamfer distance alone")
-    parser.add_argument("--judged", type=int, default=60, help="chairs for all metrics")
+    parser.add_argument(
+        "--chamfer", type=at_least(1), default=1000, help="chairs for the Chamfer distance alone"
+    )
+    parser.add_argument("--judged", type=at_least(2), default=60, help="chairs for all metrics")
     parser.add_argument("--space", type=Path, help="folder of a trained run")
-    parser.add_argument("--resolutions", type=int, nargs="+", default=[128, 256])
-    parser.add_argument("--known", type=int, default=16, help="shapes of the space to evaluate")
+    parser.add_argument("--resolutions", type=at_least(2), nargs="+", default=[128, 256])
+    parser.add_argument("--known", type=at_least(1), default=16, help="shapes of the space to evaluate")
     arguments = parser.parse_args()
+    if arguments.space:
+        read_run(arguments.space.resolve())  # a wrong folder is told before minutes of measuring
     print("| what | shapes | seconds | of a processor | shapes a minute | minutes for 1000 | peak GiB |")
     print("| --- " * 7 + "|")
     time_chamfer(arguments.chamfer)
@@ -110,4 +115,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from runs import ROOT, train
+from runs import ROOT, at_least, run_benchmark, train
 
 import sdfhub
 from sdfhub.data.batches import signed_samples
@@ -102,8 +102,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--space", type=Path, help="folder of a trained run")
     parser.add_argument("--experiment", default="fft_siren", help="what to train where no run is given")
-    parser.add_argument("--shapes", type=int, default=32)
-    parser.add_argument("--reference", type=int, default=4, help="of these also by DeepSDF's recipe")
+    parser.add_argument("--shapes", type=at_least(1), default=32)
+    parser.add_argument("--reference", type=at_least(0), default=4, help="of these also by DeepSDF's recipe")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if (space := arguments.space) is None:
@@ -117,4 +117,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -30,6 +30,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from runs import at_least, run_benchmark
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sdfhub.data import shards, store
@@ -154,11 +155,15 @@ def copy_rate() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=100, help="a multiple of 100")
-    parser.add_argument("--real", type=int, default=20, help="shapes to prepare; the others are copies")
+    parser.add_argument("--rounds", type=at_least(1), default=3)
+    parser.add_argument("--steps", type=at_least(100), default=100, help="a multiple of 100")
+    parser.add_argument(
+        "--real", type=at_least(1), default=20, help="shapes to prepare; the others are copies"
+    )
     parser.add_argument("--keep", action="store_true", help="leave the store for the next time")
     arguments = parser.parse_args()
+    if arguments.steps % 100:
+        parser.error(f"--steps {arguments.steps}: must be a multiple of 100")
     shapes = filled_store(arguments.real)
     try:
         report(shapes, arguments)
@@ -204,4 +209,4 @@ def report(shapes: Store, arguments: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -15,6 +15,7 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):
     os.environ[name] = "1"
 
 import numpy as np  # noqa: E402
+from runs import at_least, run_benchmark  # noqa: E402
 
 from sdfhub.data.preparation import Preparation  # noqa: E402
 from sdfhub.data.sampling import prepare_mesh  # noqa: E402
@@ -42,7 +43,7 @@ def bumpy_sphere(side: int = SIDE, radius: float = 1.0) -> tuple[np.ndarray, np.
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hidden", action="store_true", help="put the faces where no view sees them")
-    parser.add_argument("--samples", type=int, default=500_000)
+    parser.add_argument("--samples", type=at_least(2), default=500_000)
     args = parser.parse_args()
     vertices, faces = bumpy_sphere()
     if args.hidden:
@@ -60,4 +61,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from runs import ROOT, train
+from runs import ROOT, at_least, run_benchmark, train
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -177,12 +177,15 @@ def peak_elsewhere(name: str, shapes: int) -> str:
 
 
 def main() -> None:
+    names = [*SPACES, "untrained"]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--whole", action="store_true", help="100 shapes a space")
-    parser.add_argument("--shapes", type=int, help="a space, all compared and timed")
-    parser.add_argument("--compare", type=int, default=96, help="resolution of the comparison")
-    parser.add_argument("--dense", type=int, default=1, help="shapes whose dense mesh is timed, at 256^3")
-    parser.add_argument("--spaces", nargs="+", default=[*SPACES, "untrained"])
+    parser.add_argument("--shapes", type=at_least(1), help="a space, all compared and timed")
+    parser.add_argument("--compare", type=at_least(2), default=96, help="resolution of the comparison")
+    parser.add_argument(
+        "--dense", type=at_least(1), default=1, help="shapes whose dense mesh is timed, at 256^3"
+    )
+    parser.add_argument("--spaces", nargs="+", choices=names, default=names)
     parser.add_argument("--only", choices=("compared", "measured"))
     parser.add_argument("--peak", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -210,4 +213,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -32,6 +32,7 @@ import numpy as np  # noqa: E402
 import trimesh  # noqa: E402
 from embreex.rtcore_scene import EmbreeScene  # noqa: E402
 from manifold3d import Manifold, OpType  # noqa: E402
+from runs import at_least, run_benchmark  # noqa: E402
 
 from sdfhub.data import sampling, visibility  # noqa: E402
 from sdfhub.data.preparation import Preparation  # noqa: E402
@@ -39,7 +40,10 @@ from sdfhub.data.procedural import generate  # noqa: E402
 from sdfhub.data.signs import SIGN_METHODS, morton_order  # noqa: E402
 from sdfhub.data.sources import OpenSource  # noqa: E402
 from sdfhub.data.workers import map_in_processes  # noqa: E402
-from sdfhub.errors import RejectedMesh  # noqa: E402
+from sdfhub.errors import (
+    RejectedMesh,
+    SdfhubError,
+)
 from sdfhub.shapes import ShapeSamples  # noqa: E402
 from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 from tests.categories import CATEGORIES  # noqa: E402
@@ -128,6 +132,8 @@ def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
             yield shape.id, lambda shape=shape: source.load(shape)
         return
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise SdfhubError(f"{folder}: no meshes ({', '.join(sorted(SUFFIXES))}) in there")
     for path in paths[:: max(1, len(paths) // limit)][:limit]:
         yield path.stem, lambda path=path: _loaded(path)
 
@@ -253,13 +259,15 @@ def main() -> None:
     parser.add_argument(
         "folder", nargs="?", type=Path, help="meshes, or `open`; procedural chairs if left out"
     )
-    parser.add_argument("--samples", type=int, default=500_000)
-    parser.add_argument("--limit", type=int, default=8, help="at most this many meshes")
+    parser.add_argument("--samples", type=at_least(2), default=500_000)
+    parser.add_argument("--limit", type=at_least(1), default=8, help="at most this many meshes")
     parser.add_argument("--all", action="store_true", help="every mesh")
     parser.add_argument("--workers", action="store_true", help="one and two processes instead")
     args = parser.parse_args()
     limit = 10**9 if args.all else args.limit
     if args.workers:
+        if args.folder not in (None, Path("open")):
+            parser.error(f"--workers: takes `open` or no folder, not {args.folder}")
         print_scaling(args.folder, limit, Preparation(samples=args.samples))
         return
     print_rates(args.folder, limit, Preparation(samples=args.samples))
@@ -267,4 +275,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

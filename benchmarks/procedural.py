@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from runs import at_least, run_benchmark
 
 from sdfhub.data.procedural import CATEGORIES, generate
 from sdfhub.geometry.contact_sheet import contact_sheet
@@ -28,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--shapes", type=int, default=100)
+    parser.add_argument("--shapes", type=at_least(1), default=100)
     parser.add_argument("--sheet", type=Path, help="folder for contact sheets")
     args = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # booleans use every core they are given
@@ -46,4 +47,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from runs import at_least, run_benchmark
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -157,9 +158,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--space", type=Path, required=True, help="folder of a trained run")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--shapes", type=int, default=8)
-    parser.add_argument("--strangers", type=int, default=6)
-    parser.add_argument("--reference", type=int, default=0, help="shapes also fitted by DeepSDF's recipe")
+    parser.add_argument("--shapes", type=at_least(1), default=8)
+    parser.add_argument("--strangers", type=at_least(0), default=6)
+    parser.add_argument(
+        "--reference", type=at_least(0), default=0, help="shapes also fitted by DeepSDF's recipe"
+    )
     parser.add_argument("--base", type=float, help="median excess from samples, where these are not run")
     parser.add_argument("--sheet", type=Path, help="PNG: the truth above its reconstructions")
     arguments, overrides = parser.parse_known_args()
@@ -228,4 +231,4 @@ def truth_of(shape: StoredShape) -> Mesh:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark(main)

@@ -1,10 +1,19 @@
-"""Runs train.py as a user would and reads what it wrote."""
+"""What the benchmarks share: trainings as a user runs them, and one line for a user's mistake."""
 
+import argparse
 import json
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from sdfhub.errors import SdfhubError
+from sdfhub.tasks.wording import one_line
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -13,7 +22,7 @@ def train(name: str, *overrides: str) -> dict:
     """The content of `metrics.json` of one run under outputs/benchmarks/<name>; its output goes to stderr.
 
     Raises:
-        RuntimeError: the run failed; the message is its own last line.
+        SdfhubError: the run failed; the message is its own last line.
     """
     folder = ROOT / "outputs" / "benchmarks" / name
     shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
@@ -26,5 +35,26 @@ def train(name: str, *overrides: str) -> dict:
     ]
     done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
     if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise SdfhubError(last.removeprefix("sdfhub: error: "))
     return json.loads((folder / "metrics.json").read_text())
+
+
+def run_benchmark(main: Callable[[], None]) -> None:
+    """Runs a benchmark; a user's mistake is one line on stderr and exit status 2, as with every task."""
+    try:
+        main()
+    except (SdfhubError, HydraException, OmegaConfBaseException, OSError) as error:
+        print(f"{Path(sys.argv[0]).name}: error: {one_line(error)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """What argparse takes as the `type` of a whole number that is not below `least`."""
+
+    def number(text: str) -> int:
+        if not re.fullmatch(r"-?\d+", text) or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number of at least {least}")
+        return int(text)
+
+    return number

@@ -19,12 +19,13 @@ writes what it makes once, at the rate of a copy. There too encoding=hash, by te
 is installed, by tiny-cuda-nn.
 """
 
+from runs import at_least, run_benchmark
+
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
 import argparse
 import statistics
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -247,13 +248,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--shapes", type=int, default=4)
-    parser.add_argument("--samples", type=int, default=4096)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--threads", type=int, help="default: what torch takes")
+    parser.add_argument("--shapes", type=at_least(1), default=4)
+    parser.add_argument("--samples", type=at_least(2), default=4096)
+    parser.add_argument("--rounds", type=at_least(1), default=5)
+    parser.add_argument("--threads", type=at_least(1), help="default: what torch takes")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: PyTorch finds no GPU here")
     if args.threads:
         torch.set_num_threads(args.threads)
     register_resolvers()
@@ -346,4 +349,4 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_benchmark(main)

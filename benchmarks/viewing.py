@@ -6,9 +6,11 @@ Prints a Markdown table of milliseconds at the resolutions that the page goes th
 Transfer to the browser (loopback) and drawing come on top.
 """
 
+import argparse
 import queue
 import statistics
-import sys
+
+from runs import at_least, run_benchmark
 
 import sdfhub
 from sdfhub.tasks.live_meshing import LiveMesher, Meshed
@@ -28,13 +30,17 @@ def milliseconds(space: sdfhub.Space, resolution: int, shapes: int) -> float:
     return 1e3 * statistics.median(found[1:])
 
 
-def main(run: str, shapes: int = 8) -> None:
-    space = sdfhub.load(run)
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", help="folder of a trained run")
+    parser.add_argument("shapes", nargs="?", type=at_least(1), default=8)
+    arguments = parser.parse_args()
+    space = sdfhub.load(arguments.run)
     weights = sum(weight.numel() for weight in space.decoder.parameters())
-    print(f"{run}: {weights:,} weights, on {space.device}\n\n| grid | ms |\n| --- | --- |")
+    print(f"{arguments.run}: {weights:,} weights, on {space.device}\n\n| grid | ms |\n| --- | --- |")
     for resolution in RESOLUTIONS:
-        print(f"| {resolution}^3 | {milliseconds(space, resolution, shapes):.0f} |", flush=True)
+        print(f"| {resolution}^3 | {milliseconds(space, resolution, arguments.shapes):.0f} |", flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], *map(int, sys.argv[2:]))
+    run_benchmark(main)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from omegaconf import DictConfig
-from pydantic import NonNegativeInt
+from pydantic import NonNegativeInt, PositiveInt
 
 from sdfhub.data import store as stores
 from sdfhub.data.sampling import Preparation
@@ -66,7 +66,7 @@ def prepare_part(data: Mapping[str, Any], part: str) -> None:
     source, roles = source_and_split(data)
     preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
     own = (roles.train + roles.test)[i - 1 :: n]
-    workers = check(data["workers"], int | None, "data.workers")
+    workers = check(data["workers"], PositiveInt | None, "data.workers")
     made = stores.prepare_part(source, own, preparation, check(data["store"], str, "data.store"), workers)
     print(f"part {part}: {_counted(len(own))}, {made} of them prepared now", flush=True)
 
@@ -93,7 +93,7 @@ def stored_split(source: Source, roles: Split, preparation: Preparation, data: M
         roles.train + roles.test,
         preparation,
         root=check(data["store"], str, "data.store"),
-        workers=check(data["workers"], int | None, "data.workers"),
+        workers=check(data["workers"], PositiveInt | None, "data.workers"),
     )
     train = [store[shape.id] for shape in roles.train if shape.id in store]
     held_out = [store[shape.id] for shape in roles.test if shape.id in store]

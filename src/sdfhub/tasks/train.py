@@ -1,6 +1,7 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
 import os
+import re
 import sys
 import warnings
 from dataclasses import dataclass
@@ -228,9 +229,10 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     make = build(node, "trainer", within="lightning.pytorch", **ours)
     try:
         trainer = make()
-    except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
-        hint = "; trainer=auto takes what this machine has" if "ccelerator" in str(error) else ""
-        raise SdfhubError(f"trainer: {error}{hint}") from error
+    except (ValueError, TypeError, RuntimeError, ImportError, MisconfigurationException) as error:
+        absent = isinstance(error, ImportError) or re.search("ccelerator|backend", str(error))
+        hint = "; trainer=auto takes what this machine has" if absent else ""
+        raise SdfhubError(f"trainer: {str(error).rstrip('.')}{hint}") from error
     if trainer.accumulate_grad_batches != 1:  # large batches are worked on in pieces anyway
         raise SdfhubError(
             "trainer.accumulate_grad_batches: a step is one batch; raise data.loader.samples_per_shape"
