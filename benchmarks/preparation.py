@@ -40,10 +40,7 @@ from sdfhub.data.procedural import generate  # noqa: E402
 from sdfhub.data.signs import SIGN_METHODS, morton_order  # noqa: E402
 from sdfhub.data.sources import OpenSource  # noqa: E402
 from sdfhub.data.workers import map_in_processes  # noqa: E402
-from sdfhub.errors import (
-    RejectedMesh,
-    SdfhubError,
-)
+from sdfhub.errors import RejectedMesh, SdfhubError  # noqa: E402
 from sdfhub.shapes import ShapeSamples  # noqa: E402
 from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 from tests.categories import CATEGORIES  # noqa: E402
