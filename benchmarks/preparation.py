@@ -130,7 +130,7 @@ def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
         return
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not paths:
-        raise SdfhubError(f"{folder}: no meshes ({', '.join(sorted(SUFFIXES))}) in there")
+        raise SdfhubError(f"{folder}: is no folder with meshes ({', '.join(sorted(SUFFIXES))})")
     for path in paths[:: max(1, len(paths) // limit)][:limit]:
         yield path.stem, lambda path=path: _loaded(path)
 

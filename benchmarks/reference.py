@@ -34,10 +34,10 @@ class ReferenceDecoder(nn.Module):
 
 
 class ReferenceStep:
-    """One step of DeepSDF's published training."""
+    """One step of DeepSDF's published training, which knows no bfloat16; by `bf16` its products have it."""
 
-    def __init__(self, files: list[Path], samples: int, device: torch.device):
-        self.files, self.samples, self.device = files, samples, device
+    def __init__(self, files: list[Path], samples: int, device: torch.device, bf16: bool = False):
+        self.files, self.samples, self.device, self.bf16 = files, samples, device, bf16
         self.decoder = ReferenceDecoder().to(device)
         self.codes = nn.Embedding(len(files), 256, max_norm=1.0).to(device)
         self.parts = 1 if device.type == "cpu" else 4
@@ -70,7 +70,9 @@ class ReferenceStep:
         for some, of_shapes in zip(rows.chunk(self.parts), which.chunk(self.parts), strict=True):
             target = some[:, 3:].clamp(-0.1, 0.1)
             codes = self.codes(of_shapes)
-            predicted = self.decoder(torch.cat([codes, some[:, :3]], dim=1)).clamp(-0.1, 0.1)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+                predicted = self.decoder(torch.cat([codes, some[:, :3]], dim=1))
+            predicted = predicted.float().clamp(-0.1, 0.1)
             loss = F.l1_loss(predicted, target, reduction="sum") / len(rows)
             loss = loss + 1e-4 * codes.norm(dim=1).sum() / len(rows)
             loss.backward()

@@ -4,12 +4,14 @@
     python benchmarks/training.py --device cuda --shapes 64 --samples 16384
 
 Every round times one step of each rival, one after the other, so that a machine's moods hit all alike;
-printed are medians over the rounds. DeepSDF's step (reference.py) is re-implemented from its description:
-its network (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the
-batch, its prior |z|, Adam, and its data path, one npz file a shape read anew at every step. Steps of ours
-include the draw of their samples from the store. Only samples with a signed distance are counted: what
-normals cost is on our account. The limit is the rate of a product [points worked on together, W] x [W, W],
-W the width of the decoder, timed in the same rounds.
+printed are medians over the rounds, after three that warm up, and how far the slowest and the fastest are
+apart. DeepSDF's step (reference.py) is re-implemented from its description: its network (weight norm, dropout
+0.2, the code concatenated to every point), its sum of clamped L1 over the batch, its prior |z|, Adam, and its
+data path, one npz file a shape read anew at every step. It computes in float32; a second one has bfloat16
+products, so that steps of ours that have them can be compared with their like. Steps of ours include the draw
+of their samples from the store. Only samples with a signed distance are counted: what normals cost is on our
+account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
+decoder, timed in the same rounds.
 
 On a GPU our samples lie in its memory and the decoder is compiled, as `trainer=gpu` does it; DeepSDF's step
 is given samples that wait on the device, as if its loaders took no time, and works on a batch in four parts
@@ -47,6 +49,9 @@ from sdfhub.tasks.run import build_autodecoder
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STORED = 100_000
 """Samples of each kind in a shape's file; a draw does not depend on what they are."""
+WARM_UP = 3
+"""Rounds that do not count: the reference is a fifth slower until freed memory is of the right sizes."""
+REFERENCE = "DeepSDF, reference"
 PAPER_SAMPLES = 2000 * 16_384
 """Samples of a shape in the paper's training."""
 
@@ -205,10 +210,11 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     surface = args.samples // 4  # as at scale=paper
     rows = args.shapes * args.samples
     device = torch.device(args.device)
-    made: dict[str, object] = {"DeepSDF, reference": ReferenceStep(files, args.samples, device)}
+    made: dict[str, object] = {}
     for bf16 in (False, True):
         suffix = ", bf16" if bf16 else ""
         made |= {
+            REFERENCE + suffix: ReferenceStep(files, args.samples, device, bf16),
             "decoder=deepsdf" + suffix: OurStep(shapes, args.samples, 0, deepsdf, bf16, device),
             "paper_585k, HOSC, normals=off" + suffix: OurStep(
                 shapes, args.samples, 0, ["normals=off", *paper], bf16, device
@@ -250,7 +256,7 @@ def main() -> None:
     )
     parser.add_argument("--shapes", type=at_least(1), default=4)
     parser.add_argument("--samples", type=at_least(2), default=4096)
-    parser.add_argument("--rounds", type=at_least(1), default=5)
+    parser.add_argument("--rounds", type=at_least(3), default=5)
     parser.add_argument("--threads", type=at_least(1), help="default: what torch takes")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("overrides", nargs="*")
@@ -270,12 +276,12 @@ def main() -> None:
         steps = rivals(args, Path(folder))
         limits = limits_of(steps, torch.device(args.device))
         times = {name: [] for name in (*steps, *limits)}
-        for round_ in range(args.rounds + 1):  # the first warms up
+        for round_ in range(args.rounds + WARM_UP):
             for name, step in (steps | limits).items():
                 taken = seconds_of(step, args.device == "cuda")
-                if round_:
+                if round_ >= WARM_UP:
                     times[name].append(taken)
-    report(args, steps, limits, {name: statistics.median(taken) for name, taken in times.items()})
+    report(args, steps, limits, times)
 
 
 def seconds_of(step, on_gpu: bool) -> float:
@@ -309,8 +315,9 @@ def limit_of(step) -> tuple[int, bool]:
     return max(sum(layer.columns[:2]) for layer in step.model.decoder.layers), step.bf16
 
 
-def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -> None:
+def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str, list[float]]) -> None:
     """Prints Markdown tables."""
+    seconds = {name: statistics.median(taken) for name, taken in times.items()}
     rows = args.shapes * args.samples
     copy = limits.pop("copy", None)
     rate = {key: product.operations() / seconds[key] for key, product in limits.items()}
@@ -322,18 +329,23 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, seconds: dict) -
     if copy:
         print(f"copy: {copy.bytes() / seconds['copy'] / 1e9:.0f} GB a second, read and written")
     memory = " | of the copy's" if copy else ""
-    print(f"\n| step | samples/s | times DeepSDF | share of the product's rate{memory} |")
-    print("| --- | --- | --- | --- |" + " --- |" * bool(copy))
-    reference = seconds["DeepSDF, reference"]
+    print(
+        f"\n| step | samples/s | apart | times DeepSDF | in bf16 too | share of the product's rate{memory} |"
+    )
+    print("| --- " * (6 + bool(copy)) + "|")
     for name, step in steps.items():
         shares = [0.0] * (1 + bool(copy))
         if hasattr(step, "operations"):
             shares[0] = step.operations() / seconds[name] / rate[limit_of(step)]
         if copy and hasattr(step, "bytes"):
             shares[1] = step.bytes() / seconds[name] / (copy.bytes() / seconds["copy"])
-        times = "" if isinstance(step, OurField) else f"{reference / seconds[name]:.2f}"
-        cells = " | ".join(f"{share:.2f}" if share else "" for share in shares)
-        print(f"| {name} | {rows / seconds[name]:,.0f} | {times} | {cells} |")
+        apart = (max(times[name]) - min(times[name])) / seconds[name]
+        faster = ["", ""]
+        if not isinstance(step, OurField):
+            faster[0] = f"{seconds[REFERENCE] / seconds[name]:.2f}"
+            faster[1] = f"{seconds[f'{REFERENCE}, bf16'] / seconds[name]:.2f}" if step.bf16 else ""
+        cells = " | ".join([*faster, *(f"{share:.2f}" if share else "" for share in shares)])
+        print(f"| {name} | {rows / seconds[name]:,.0f} | {apart:.0%} | {cells} |")
     for bf16 in ("", ", bf16"):
         on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
         print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")

@@ -14,7 +14,7 @@ from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
 from sdfhub.errors import SdfhubError
 from sdfhub.model import computing
-from sdfhub.model.activations import Hosc, Relu, Siren, joined
+from sdfhub.model.activations import Activation, Hosc, Relu, Siren, joined
 from sdfhub.model.computing import Computing
 from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
@@ -444,3 +444,23 @@ def test_a_shift_of_another_number_of_shapes_is_refused_not_read_beyond_its_end(
     for wrong in (shift[:2], torch.zeros(21)):
         with pytest.raises(ValueError, match="does not fit"):
             activation.shifted(product, wrong)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
+def test_what_stands_beside_other_points_is_refused_not_read_beyond_its_end(activation):
+    product, shift = products()
+    for wrong in (torch.ones(1, product.shape[1], 1), torch.ones(product.shape[0], 2, 1)):
+        with pytest.raises(ValueError, match="cannot stand beside"):
+            activation.shifted(product, shift, wrong)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda a: type(a).__name__)
+def test_a_layer_all_in_bfloat16_is_what_plain_operations_make_of_it(activation):
+    product, shift = (each.detach().bfloat16() for each in products())
+    weights = shift.clone().requires_grad_()
+    fast = activation.shifted(product, weights)
+    plain = Activation.shifted(activation, product.float(), shift.float())
+    assert fast.dtype == torch.bfloat16
+    torch.testing.assert_close(fast.float(), plain, rtol=0.01, atol=0.01)
+    fast.float().sum().backward()
+    assert weights.grad.dtype == torch.bfloat16 and weights.grad.isfinite().all()

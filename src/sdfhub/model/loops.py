@@ -49,15 +49,28 @@ def flat(tensor: Tensor) -> np.ndarray:
 
 
 def flat_shift(shift: Tensor, product: Tensor) -> np.ndarray:
-    """[B, W] or [1, W] of the same memory as a shift [B, 1, W] or [W] of a product [B, N, W].
+    """[B, W] or [1, W] of the numbers of a shift [B, 1, W] or [W] of a product [B, N, W], float32.
 
     Raises:
         ValueError: it is of other shapes; a loop would read beyond its end.
     """
-    rows = flat(shift)
+    rows = flat(shift.float())
     if rows.shape not in ((1, product.shape[2]), (product.shape[0], product.shape[2])):
         raise ValueError(f"a shift {list(shift.shape)} does not fit products {list(product.shape)}")
     return rows
+
+
+def flat_beside(beside: Tensor | None, product: Tensor) -> np.ndarray | None:
+    """[B N, F] of the numbers of [B, N, F], with the dtype of what a loop makes of a product [B, N, W].
+
+    Raises:
+        ValueError: it is of other shapes; a loop would read beyond its end.
+    """
+    if beside is None:
+        return None
+    if beside.shape[:2] != product.shape[:2]:
+        raise ValueError(f"{list(beside.shape)} cannot stand beside products {list(product.shape)}")
+    return flat(beside.to(result_dtype(product)))
 
 
 def chunks(product: Tensor) -> int:

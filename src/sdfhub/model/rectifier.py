@@ -13,6 +13,7 @@ from sdfhub.model.loops import (
     ROWS,
     chunks,
     flat,
+    flat_beside,
     flat_shift,
     narrowed,
     over_points,
@@ -49,7 +50,7 @@ class Rectifier(torch.autograd.Function):
             flat(product),
             flat_shift(shift, product),
             points,
-            None if beside is None else flat(beside.to(dtype)),
+            flat_beside(beside, product),
         )
         drops = (_u(round(dropout * 2**32)), _seed()) if dropout else (None, None)
         ctx.factor, ctx.width = 1 / (1 - dropout), width

@@ -1,8 +1,8 @@
 """sin(omega x) and tanh(beta sin(omega x)) on the CPU: one pass over memory forward, one backward.
 
 Backward recomputes from the product: nothing else is kept. Sines and hyperbolic tangents are polynomials
-fitted by least squares at Chebyshev nodes: errors below 1e-6 for angles omega x up to 1e7. From 1e9 on, where
-float32 numbers lie further apart than a wave is long, sines are not bounded, and a diverged training shows.
+fitted by least squares at Chebyshev nodes: errors below 1e-6 for angles omega x up to 2e6. Beyond 2e7, where
+float32 numbers lie a radian and more apart, sines and the slopes of HOSC are not even bounded.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from sdfhub.model.loops import (
     ROWS,
     chunks,
     flat,
+    flat_beside,
     flat_shift,
     narrowed,
     over_points,
@@ -54,7 +55,7 @@ class Wave(torch.autograd.Function):
         dtype = result_dtype(product)
         value = product.new_empty(shapes, points, both, dtype=dtype)
         slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
-        to_copy = None if beside is None else flat(beside.to(dtype))
+        to_copy = flat_beside(beside, product)
         results = flat(value), flat(slope) if with_slope else None
         with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
         return (value, slope) if with_slope else value

@@ -85,10 +85,14 @@ def write_scores(
         shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
         result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
     write_whole(out / "metrics.csv", _csv(judged))
-    _write_sheet([row for row in judged if row.pictures], out / "contact_sheet.png")
+    if shown := [row for row in judged if row.pictures]:
+        _write_sheet(shown, out / "contact_sheet.png")
     write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
     print(table(judged))
-    print(f"\nmeshes:        {out / 'meshes'}\ncontact sheet: {out / 'contact_sheet.png'}")
+    if judged:
+        print(f"\nmeshes:        {out / 'meshes'}")
+    if shown:
+        print(f"contact sheet: {out / 'contact_sheet.png'}")
     _print_places(out, trained=training is not None)
     return result
 
@@ -141,7 +145,7 @@ def _csv(judged: Sequence[Judged]) -> str:
 def _write_sheet(shown: Sequence[Judged], path: Path) -> None:
     """Ground truth above reconstruction; CD times 10^3, as in the table."""
     captions = [f"{row.shape.id}\n{_title(row)}" for row in shown]
-    pictures = list(zip(*(row.pictures for row in shown), strict=True)) or [(), ()]
+    pictures = list(zip(*(row.pictures for row in shown), strict=True))
     contact_sheet(pictures, ["ground truth", "reconstruction"], captions, path)
 
 

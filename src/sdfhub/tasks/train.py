@@ -15,7 +15,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
-from pydantic import PositiveInt
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from sdfhub.data.batches import Loading
@@ -45,10 +45,9 @@ from sdfhub.tasks.run import (
 from sdfhub.tasks.search import objective
 from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 
-OTHER_PRECISIONS = ("16", "16-mixed", "16-true", "bf16-true", "64", "64-true", "transformer-engine")
-"""What Lightning offers and we do not: pieces of a batch are differentiated without a loss scale, and the
-loops know float32 and bfloat16."""
-
+PRECISIONS = ("32-true", "32", "bf16-mixed", "bf16", "None")
+"""Not all that Lightning offers: pieces of a batch are differentiated without a loss scale, and the loops
+know float32 and bfloat16."""
 
 NO_CONCERN = (
     ".*does not have many workers.*",
@@ -222,8 +221,9 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     Raises:
         SdfhubError: names the setting.
     """
-    if str(node.get("precision")) in OTHER_PRECISIONS:
-        raise SdfhubError(f"trainer.precision={node['precision']}: use 32-true or bf16-mixed")
+    if str(node.get("precision")) not in PRECISIONS:
+        raise SdfhubError(f"trainer.precision={node['precision']!r}: use 32-true or bf16-mixed")
+    check(node.get("gradient_clip_val"), NonNegativeFloat | None, "trainer.gradient_clip_val")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     ours = {"default_root_dir": run, "logger": logger, "callbacks": callbacks, "plugins": WholeFileIO()}
     make = build(node, "trainer", within="lightning.pytorch", **ours)
@@ -231,8 +231,8 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
         trainer = make()
     except (ValueError, TypeError, RuntimeError, ImportError, MisconfigurationException) as error:
         absent = isinstance(error, ImportError) or re.search("ccelerator|backend", str(error))
-        hint = "; trainer=auto takes what this machine has" if absent else ""
-        raise SdfhubError(f"trainer: {str(error).rstrip('.')}{hint}") from error
+        hint = "; trainer.accelerator=auto trainer.devices=auto takes what this machine has" if absent else ""
+        raise SdfhubError(f"trainer: {str(error).rstrip('.!')}{hint}") from error
     if trainer.accumulate_grad_batches != 1:  # large batches are worked on in pieces anyway
         raise SdfhubError(
             "trainer.accumulate_grad_batches: a step is one batch; raise data.loader.samples_per_shape"
