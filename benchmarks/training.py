@@ -27,6 +27,7 @@ import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
 import argparse
+import re
 import statistics
 import tempfile
 import time
@@ -52,6 +53,8 @@ STORED = 100_000
 WARM_UP = 3
 """Rounds that do not count: the reference is a fifth slower until freed memory is of the right sizes."""
 REFERENCE = "DeepSDF, reference"
+UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "search", "sweeps", "hydra")
+"""Groups of a training that a step without data, judging or a loop around it does not read."""
 PAPER_SAMPLES = 2000 * 16_384
 """Samples of a shape in the paper's training."""
 
@@ -263,6 +266,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: PyTorch finds no GPU here")
+    for override in args.overrides:
+        if re.split("[.=]", override.lstrip("+~"))[0] in UNREAD:
+            parser.error(f"{override}: no step here reads it; --shapes and --samples say what a batch has")
     if args.threads:
         torch.set_num_threads(args.threads)
     register_resolvers()

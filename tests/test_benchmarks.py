@@ -13,6 +13,8 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 MISTAKES = {
     "evaluation.py --space nowhere": ["not a run's folder", "nowhere"],
     "evaluation.py --judged 1": ["argument --judged: '1': must be a whole number of at least 2"],
+    "training.py data.shapes=x": ["data.shapes=x", "--shapes and --samples"],
+    "training.py encoding=nonsense": ["nonsense", "fourier"],
     "viewing.py nowhere": ["nowhere: there is no such run or file"],
     "viewing.py . many": ["'many': must be a whole number of at least 1"],
     "growth.py --steps 150": ["--steps 150: must be a multiple of 100"],

@@ -174,6 +174,7 @@ MISTAKES = {
     "trainer.max_epochs=null": ["trainer.max_epochs", "at least 1"],
     "trainer.max_epochs=-1": ["trainer.max_epochs=-1", "at least 1"],
     "trainer.precision=foo": ["trainer.precision='foo'", "32-true"],
+    "+trainer.strategy=fsdp": ["trainer.strategy=fsdp", "auto or ddp"],
     "output_root=/proc/nowhere": ["/proc/nowhere"],
     "codes.size=7": ["codes.size"],
     "seed=x": ["seed"],

@@ -108,6 +108,21 @@ def test_the_polynomials_of_the_loops_are_good_to_a_millionth():
     assert (steep.double() - (20 * x.double().sin()).tanh()).abs().max() < 1e-5  # 20 times the sine's error
 
 
+@pytest.mark.parametrize("beta", [8.0, 32.0, 100.0])
+def test_where_hosc_is_flat_the_loops_say_so(beta):
+    """Nearly every point lies there: an error of one sign would add up in the gradient by beta."""
+    activation, x = Hosc(1.0, 1.0, beta), torch.linspace(-30, 30, 100_001)[None, :, None]
+    exactly = deepcopy(activation).double()
+    value, slope = activation.shifted_with_slope(x, torch.zeros(1))
+    assert value.abs().max() <= 1 + 2**-23
+    exact_slope = exactly.with_slope(x.double())[1]
+    assert ((slope - exact_slope) * exact_slope.sign()).mean().abs() < 1e-6
+    by = x.sin().sign()  # all terms have the same sign
+    (have,) = torch.autograd.grad(value, activation.log_beta, by)
+    terms = terms_of_beta(exactly, x.double(), [by])
+    assert (have - terms.sum()).abs() < 3e-5 * terms.abs().sum()
+
+
 def test_numbers_that_are_not_finite_stay_so():
     product = torch.tensor([[[float("nan"), float("inf"), 1.0]]])
     value = Hosc(5.0, 3.0, 2.0).shifted(product, torch.zeros(3))

@@ -1,8 +1,9 @@
 """sin(omega x) and tanh(beta sin(omega x)) on the CPU: one pass over memory forward, one backward.
 
-Backward recomputes from the product: nothing else is kept. Sines and hyperbolic tangents are polynomials
-fitted by least squares at Chebyshev nodes: errors below 1e-6 for angles omega x up to 2e6. Beyond 2e7, where
-float32 numbers lie a radian and more apart, sines and the slopes of HOSC are not even bounded.
+Backward recomputes from the product: nothing else is kept. Sines are polynomials fitted by least squares at
+Chebyshev nodes, errors below 1e-6 for angles omega x up to 2e6; beyond 2e7, where float32 numbers lie a radian
+and more apart, sines and the slopes of HOSC are not even bounded. A hyperbolic tangent is a ratio of two, of
+the least largest error and 1 from 9 on: one that kept away from 1 would have slopes where HOSC is flat.
 """
 
 from collections.abc import Callable
@@ -109,10 +110,10 @@ def _sin_cos(angle):
 def _tanh(x):
     x = min(max(x, _f(-9)), _f(9))
     s = x * x
-    over = _f(0.0034865936) + s * (_f(2.0471998e-05) + s * _f(1.3184417e-08))
-    under = _f(0.025842024) + s * (_f(0.00032713933) + s * _f(7.702751e-07))
-    over = _f(0.9999999) + s * (_f(0.13373208) + s * over)
-    return x * over / (_f(1) + s * (_f(0.46706504) + s * under))
+    over = _f(0.0034676355) + s * (_f(2.0156067e-05) + s * _f(1.27440565e-08))
+    under = _f(0.025770275) + s * (_f(0.00032402007) + s * _f(7.5227825e-07))
+    over = _f(1) + s * (_f(0.13357376) + s * over)
+    return x * over / (_f(1) + s * (_f(0.4669068) + s * under))
 
 
 @numba.njit(parallel=True, fastmath=FAST, cache=True)

@@ -48,6 +48,9 @@ from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 PRECISIONS = ("32-true", "32", "bf16-mixed", "bf16", "None")
 """Not all that Lightning offers: pieces of a batch are differentiated without a loss scale, and the loops
 know float32 and bfloat16."""
+STRATEGIES = ("auto", "ddp")
+"""Beginnings of those that leave a model whole: checkpoints, and what is drawn and judged while it trains,
+need every weight."""
 
 NO_CONCERN = (
     ".*does not have many workers.*",
@@ -223,6 +226,10 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
     """
     if str(node.get("precision")) not in PRECISIONS:
         raise SdfhubError(f"trainer.precision={node['precision']!r}: use 32-true or bf16-mixed")
+    if not str(node.get("strategy", "auto")).startswith(STRATEGIES):
+        raise SdfhubError(
+            f"trainer.strategy={node['strategy']}: use auto or ddp; every device has all weights"
+        )
     check(node.get("gradient_clip_val"), NonNegativeFloat | None, "trainer.gradient_clip_val")
     logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
     ours = {"default_root_dir": run, "logger": logger, "callbacks": callbacks, "plugins": WholeFileIO()}
