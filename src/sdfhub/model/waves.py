@@ -1,9 +1,10 @@
 """sin(omega x) and tanh(beta sin(omega x)) on the CPU: one pass over memory forward, one backward.
 
 Backward recomputes from the product: nothing else is kept. Sines are polynomials fitted by least squares at
-Chebyshev nodes, errors below 1e-6 for angles omega x up to 2e6; beyond 2e7, where float32 numbers lie a radian
-and more apart, sines and the slopes of HOSC are not even bounded. A hyperbolic tangent is a ratio of two, of
-the least largest error and 1 from 9 on: one that kept away from 1 would have slopes where HOSC is flat.
+Chebyshev nodes, errors below 1e-6 for angles omega x up to 2e6; beyond 2e7, where float32 numbers lie a
+radian and more apart, sines and the slopes of HOSC are not even bounded. A hyperbolic tangent is a ratio of
+two, of the least largest error and 1 from 9 on: one that kept away from 1 would have slopes where HOSC is
+flat.
 """
 
 from collections.abc import Callable
