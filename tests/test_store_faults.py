@@ -148,6 +148,13 @@ def test_an_array_that_claims_forty_terabytes_is_refused_before_memory_is_asked_
         prepared["balls/0000"].read("outside", 0, 5)
 
 
+def test_an_array_that_went_away_is_told_in_words(tmp_path):
+    prepared = fill(tmp_path, Balls(1))
+    (prepared.folder / "balls/0000/outside.npy").unlink()
+    with pytest.raises(SdfhubError, match=r"was prepared \(No such file or directory\); start or prepare"):
+        prepared["balls/0000"].read("outside", 0, 5)
+
+
 def changed(manifest: dict, *path: str, value) -> dict:
     node = manifest
     for key in path[:-1]:

@@ -214,7 +214,8 @@ class StoredShape:
 
     def _broken(self, name: str, error: Exception) -> SdfhubError:
         shape = [self.rows(name), COLUMNS[name]]
+        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
         return SdfhubError(
-            f"{self.folder / name}.npy: not the {shape} {DTYPES[name]} array that was prepared ({error}); "
+            f"{self.folder / name}.npy: not the {shape} {DTYPES[name]} array that was prepared ({why}); "
             "start or prepare again: what is damaged is then made anew"
         )
