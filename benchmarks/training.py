@@ -42,7 +42,8 @@ from reference import ReferenceStep
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
-from sdfhub.model.computing import keep_freed_memory
+from sdfhub.model.computing import TOGETHER, distances, keep_freed_memory
+from sdfhub.side_by_side import side_by_side
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.run import build_autodecoder
@@ -145,8 +146,7 @@ class OurField:
     @torch.no_grad()
     def __call__(self) -> None:
         codes = self.model.codes.table
-        for part in self.points.split(self.model.computing.together(codes.device), dim=1):
-            self.model.decoder(part, codes)
+        distances(self.model.decoder, self.points, codes)
 
     def operations(self) -> float:
         return operations_per_point(self.model.decoder) * self.points.shape[1]
@@ -189,17 +189,18 @@ class Copy:
 
 
 class Product:
-    """The limit: one matrix product of a layer's size."""
+    """The limit: matrix products of a layer's size, on a CPU one in each thread, which beats one in all."""
 
     def __init__(self, width: int, dtype: torch.dtype, rows: int, device: torch.device):
         self.a = torch.randn(rows, width, device=device).to(dtype)
         self.b = torch.randn(width, width, device=device).to(dtype)
+        self.count = torch.get_num_threads() if device.type == "cpu" else 1
 
     def __call__(self) -> None:
-        torch.mm(self.a, self.b)
+        side_by_side(lambda _: torch.mm(self.a, self.b), range(self.count))
 
     def operations(self) -> float:
-        return 2 * self.a.numel() * self.b.shape[1]
+        return 2 * self.a.numel() * self.b.shape[1] * self.count
 
 
 def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
@@ -311,8 +312,8 @@ def limits_of(steps: dict[str, object], device: torch.device) -> dict[object, Pr
     for step in steps.values():
         if hasattr(step, "operations"):
             key = limit_of(step)
-            together = step.model.computing.together(device)
-            made[key] = Product(key[0], torch.bfloat16 if key[1] else torch.float32, together, device)
+            dtype = torch.bfloat16 if key[1] else torch.float32
+            made[key] = Product(key[0], dtype, TOGETHER[device.type], device)
     return made
 
 

@@ -57,7 +57,9 @@ def test_imports_point_down(path):
             assert name != forbidden and not name.startswith(f"{forbidden}."), f"{ids(path)} imports {name}"
 
 
-@pytest.mark.parametrize("name", ["errors", "locks", "settings", "shapes", "triangles", "whole_file"])
+@pytest.mark.parametrize(
+    "name", ["errors", "locks", "settings", "shapes", "side_by_side", "triangles", "whole_file"]
+)
 def test_the_seams_import_no_part_of_the_house(name):
     assert not [n for n in imported_modules(SOURCE / f"{name}.py") if n.startswith("sdfhub")]
 

@@ -350,8 +350,8 @@ def test_value_and_gradient_compile_to_one_graph(choice):
 def test_computing_takes_what_suits_the_device():
     function = len
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    assert Computing().together(cpu) < Computing().together(gpu)
-    assert Computing(points_at_once=5).together(gpu) == 5
+    assert Computing().together(cpu, 2**30) < Computing().together(gpu, 2**30)
+    assert Computing(points_at_once=5).together(gpu, 100) == 5
     assert Computing().compiled(function, device=cpu) == (function,)
     assert Computing(compile=False).compiled(function, device=gpu) == (function,)
     assert Computing(compile=True).compiled(function, device=cpu) != (function,)

@@ -33,7 +33,7 @@ from sdfhub.data.scan import Scan
 from sdfhub.data.target import observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
-from sdfhub.model.computing import Computing
+from sdfhub.model.computing import distances
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.distribution import CodeDistribution
 from sdfhub.model.reconstruction import MapFit
@@ -155,12 +155,9 @@ class Space:
             raise SdfhubError(f"sdf: points of {len(points)} shapes, but codes of {len(codes)}")
         if not points.numel():
             return points.new_zeros(points.shape[1:-1] if is_one else points.shape[:-1])
-        parts = [points]
-        if not (torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)):
-            together = max(1, Computing().together(self.device) // len(points))
-            parts = points.split(together, dim=1)
-        distances = torch.cat([self.decoder(part, codes) for part in parts], dim=1)
-        return distances[0] if is_one else distances
+        differentiated = torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)
+        found = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
+        return found[0] if is_one else found
 
     def mesh(self, shape: Shape, resolution: int = 256) -> Mesh:
         """The surface of a shape, in its source's frame or, where a code has none, the normalised one.
@@ -301,7 +298,7 @@ def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Me
     _check_count("resolution", resolution, 2)
 
     def fields(points: Tensor, shapes: Tensor) -> Tensor:
-        return decoder(points, codes[shapes])
+        return distances(decoder, points, codes[shapes])
 
     try:
         yield from mesh_fields(fields, len(codes), resolution, device=codes.device)

@@ -19,7 +19,7 @@ Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices [V, 3] float64, normalised frame, and faces [F, 3] int64, counter-clockwise seen from outside."""
 
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape
-_CACHED, _LARGE = 2**13, 2**20  # points per call: what a core's cache keeps, and what fills a GPU
+_CACHED, _LARGE = 2**13, 2**20  # points per call: what a core's cache keeps, for each; what fills a GPU
 
 
 def mesh_fields(
@@ -137,7 +137,7 @@ def _grid(
     device: torch.device | str | None,
 ) -> Grid:
     device = torch.device(device or _device_of(fields) or "cpu")
-    batch = batch or (_CACHED if device.type == "cpu" else _LARGE)
+    batch = batch or (_CACHED * torch.get_num_threads() if device.type == "cpu" else _LARGE)
     return Grid(fields, shapes, resolution, bound, batch, device)
 
 

@@ -85,12 +85,14 @@ class AutoDecoder(L.LightningModule):
             batch: of training shapes.
             progress: share of training done, in [0, 1].
         """
-        limit = self.computing.together(batch.sdf.device)
+        device = batch.sdf.device
+        limit, threads = self.computing.together(device, batch.sdf.numel()), self.computing.threads(device)
         learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
-        return loss_in_pieces(lambda piece: self._parts(piece, progress), batch, limit, learned)
+        self.codes.shorten()
+        return loss_in_pieces(lambda piece: self._parts(piece, progress), batch, limit, learned, threads)
 
     def _parts(self, batch: Batch, progress: float) -> Parts:
-        codes = self.codes(batch.rows)
+        codes = self.codes.table[batch.rows]
         predicted = self._value(batch.points, codes)
         gradients = None
         if batch.surface_points.shape[1] and self.loss.wants_gradients(progress):

@@ -29,7 +29,11 @@ class CodeTable(nn.Module):
 
     def forward(self, rows: Tensor) -> Tensor:
         """Codes [B, L] of table rows [B]."""
-        if self.max_norm is not None:
-            with torch.no_grad():  # of all rows: processes that read different ones must keep equal tables
-                self.table.renorm_(2, 0, self.max_norm)
+        self.shorten()
         return self.table[rows]
+
+    @torch.no_grad()
+    def shorten(self) -> None:
+        """Shortens the codes that are too long."""
+        if self.max_norm is not None:  # all rows: processes that read different ones must keep equal tables
+            self.table.renorm_(2, 0, self.max_norm)

@@ -11,21 +11,26 @@ from typing import Literal
 
 import torch
 import torch._functorch.config as aot
+from torch import Tensor
 
 from sdfhub.errors import SdfhubError
+from sdfhub.model.decoder import Decoder
 from sdfhub.model.encodings import Encoding
 from sdfhub.model.fused_hash import can_fuse, fused
+from sdfhub.side_by_side import side_by_side
 
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
-"""Samples worked on together: what stays in a CPU's caches; what fills a GPU and not its memory."""
+"""Samples worked on together: what stays in a core's caches; what fills a GPU and not its memory."""
 
+LEAST = 2**10
+"""Samples that are worth a thread of their own."""
 
 _NO_TWIN = (
     "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
     "tiny-cuda-nn built for it; null takes it where it is there"
 )
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of options in glibc's malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,8 @@ class Computing:
     """Settings that suit a device; None takes what does.
 
     Args:
-        points_at_once: samples that go through the decoder together, >= 1; bounds memory.
+        points_at_once: samples that go through the decoder together, on a CPU in each thread, >= 1; bounds
+            memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
             None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
         tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result but for
@@ -52,9 +58,14 @@ class Computing:
         if self.points_at_once is not None and self.points_at_once < 1:
             raise ValueError(f"points_at_once must be at least 1 or null, got {self.points_at_once}")
 
-    def together(self, device: torch.device) -> int:
-        """Samples worked on together on this device."""
-        return self.points_at_once or TOGETHER.get(device.type, TOGETHER["cuda"])
+    def threads(self, device: torch.device) -> int:
+        """Threads that work on samples of their own: on a CPU all, but what is compiled has one caller."""
+        return 1 if device.type != "cpu" or self.compile else torch.get_num_threads()
+
+    def together(self, device: torch.device, samples: int) -> int:
+        """Of so many samples, those that are worked on together on this device, in one thread."""
+        most = self.points_at_once or TOGETHER.get(device.type, TOGETHER["cuda"])
+        return min(most, max(LEAST, -(-samples // self.threads(device))))
 
     def set_up(self, device: torch.device) -> None:
         """Sets the precision of this process's products, and keeps the memory it frees."""
@@ -135,14 +146,28 @@ def plain_if_broken(fast: Callable, plain: Callable) -> Callable:
     return call
 
 
+def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
+    """`decoder(points, codes)` [B, N], in parts: on a CPU side by side, else one after the other.
+
+    Args:
+        points: [B, N, 3], normalised frame.
+        codes: [B, L].
+    """
+    together = Computing().together(points.device, points.shape[0] * points.shape[1])
+    parts = points.split(max(1, together // len(points)), dim=1)
+    in_turn = side_by_side if points.is_cpu else map
+    return torch.cat([*in_turn(lambda part: decoder(part, codes), parts)], dim=1)
+
+
 def keep_freed_memory() -> None:
     """Lets this process keep blocks it has freed, up to a GiB, where the C library is glibc.
 
-    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step.
+    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step. Threads
+    share what is kept, or each would have its own.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another C library
         return
-    for option in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
-        set_option(option, 2**30)
+    for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
+        set_option(option, value)

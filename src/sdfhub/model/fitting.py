@@ -18,6 +18,7 @@ from torch import Tensor
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.gauss_newton import Quadratic, descend
 from sdfhub.model.losses import clamped_l1
+from sdfhub.side_by_side import side_by_side
 
 Draw = Callable[[int], tuple[Tensor, Tensor]]
 """Step number -> points [B, N, 3] and sdf [B, N], the next samples of B shapes."""
@@ -141,10 +142,11 @@ class GaussNewtonFit:
         with frozen(decoder):
             start = initial_codes(decoder, self.spread, seeds)
             drawn = (tensor.to(start.device) for tensor in draw(0))
-            # a CPU is as fast with one shape at a time, and then no neighbour changes even a rounding
-            together = 1 if start.device.type == "cpu" else len(start)
-            groups = zip(start.split(together), *(tensor.split(together) for tensor in drawn), strict=True)
-            return torch.cat([self._fit(decoder, *group) for group in groups])
+            if start.device.type != "cpu":
+                return self._fit(decoder, start, *drawn)
+            # a core is as fast with one shape at a time, and then no neighbour changes even a rounding
+            shapes = zip(start.split(1), *(tensor.split(1) for tensor in drawn), strict=True)
+            return torch.cat(side_by_side(lambda shape: self._fit(decoder, *shape), list(shapes)))
 
     def _fit(self, decoder, codes: Tensor, points: Tensor, sdf: Tensor) -> Tensor:
         damping = torch.full_like(codes[:, 0], self.damping)

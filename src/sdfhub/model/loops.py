@@ -6,7 +6,8 @@ used (seconds) and keeps on disk. bfloat16 numbers travel as the upper halves of
 is float32.
 """
 
-import threading
+from collections.abc import Callable
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -15,15 +16,19 @@ from llvmlite import binding, ir
 from numba.extending import intrinsic, overload
 from torch import Tensor
 
+from sdfhub.side_by_side import side_by_side
+
 ROWS = 128
-"""Points of one shape that a thread works on at a time."""
+"""Points of one shape that are added up together."""
+
+ALONE = 2**17
+"""Numbers that one thread works through sooner than it wakes another."""
 
 FAST = {"contract", "nsz", "arcp"}
 """What a compiler may change. Without "nnan" a diverged training shows; "reassoc" would undo careful sums."""
 
-_LOCK = threading.Lock()
-numba.config.THREADING_LAYER = "workqueue"
-# numba's OpenMP layer would change PyTorch's number of threads; this one takes one caller at a time
+compiled = numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+"""Makes a loop of a function. Python's error model would check every division, one number at a time."""
 
 _features = binding.get_host_cpu_features()
 if _features.get("avx512f") and not numba.config.CPU_FEATURES:
@@ -84,11 +89,17 @@ def over_points(by_shift: Tensor, shift: Tensor) -> Tensor:
     return by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
 
 
-def with_threads(kernel, *arguments) -> None:
-    """Runs a loop with as many threads as PyTorch has."""
-    with _LOCK:
-        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
-        kernel(*arguments)
+def run(kernel: Callable, product: Tensor, *arguments) -> None:
+    """Runs a loop over the chunks of a product, on as many threads as PyTorch has.
+
+    Args:
+        kernel: called with the first chunk and the one after the last, a pair, and the arguments.
+        product: [B, N, W].
+        arguments: arrays and numbers.
+    """
+    count, threads = chunks(product), torch.get_num_threads() if product.numel() > ALONE else 1
+    ends = [count * part // threads for part in range(threads + 1)]
+    side_by_side(lambda some: kernel(some, *arguments), list(pairwise(ends)))
 
 
 @intrinsic

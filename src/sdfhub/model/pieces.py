@@ -1,18 +1,25 @@
-"""A large batch in pieces: the gradient of the whole in the memory of a part.
+"""A large batch in pieces: the gradient of the whole in the memory of a part, on all cores.
 
 DeepSDF's paper batch is a million points; the activations of all of them at once would take tens of
-gigabytes, and on a CPU even a few thousand leave its caches.
+gigabytes, and on a CPU even a few thousand leave its caches. A core that works on pieces of its own waits for
+no other.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
+from sdfhub.model.dropout import drawn_from
 from sdfhub.shapes import Batch
+from sdfhub.side_by_side import side_by_side
 
 Parts = dict[str, Tensor]
 """Weighted terms of the loss by name; their sum is the loss."""
+
+Share = Sequence[Callable[[], Parts]]
+"""Pieces that one thread differentiates, one after the other: what each adds to the parts of the loss."""
 
 
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
@@ -39,7 +46,11 @@ def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
 
 
 def loss_in_pieces(
-    parts_of: Callable[[Batch], Parts], batch: Batch, points: int, parameters: Sequence[nn.Parameter]
+    parts_of: Callable[[Batch], Parts],
+    batch: Batch,
+    points: int,
+    parameters: Sequence[nn.Parameter],
+    threads: int = 1,
 ) -> tuple[Tensor, Parts]:
     """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
 
@@ -51,43 +62,58 @@ def loss_in_pieces(
         batch: to be split.
         points: samples that are worked on together, >= 1.
         parameters: what the loss is differentiated by; all take part in it.
+        threads: each differentiates pieces of its own, >= 1; `parts_of` is called from all of them.
     """
     if batch.sdf.numel() <= points:
         parts = parts_of(batch)
         return torch.stack(tuple(parts.values())).sum(), parts
-    totals: Parts = {}
 
-    def weighted() -> Iterator[Tensor]:
-        for piece, of_samples, of_normals in pieces(batch, points):
+    def weighted(piece: Batch, of_samples: float, of_normals: float, seed: int) -> Parts:
+        with drawn_from(seed):
             parts = parts_of(piece)
-            parts = {
-                name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()
-            }
-            for name, part in parts.items():
-                totals[name] = totals.get(name, 0) + part.detach()
-            yield torch.stack(tuple(parts.values())).sum()
+        return {name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()}
 
-    return _Summed.apply(weighted, *parameters), totals
+    cut = list(pieces(batch, points))
+    seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()  # here, in order: threads take turns as they like
+    each = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
+    totals: Parts = {}
+    return _Summed.apply([each[thread::threads] for thread in range(threads)], totals, *parameters), totals
 
 
 class _Summed(torch.autograd.Function):
-    """The sum of losses, differentiated one by one while it is summed, so that one graph lives at a time."""
+    """The sum of losses, differentiated while it is summed, so that one graph a thread lives at a time."""
 
     @staticmethod
-    def forward(ctx, losses: Callable[[], Iterator[Tensor]], *parameters: Tensor) -> Tensor:
-        total, gradients = 0, None
-        with torch.enable_grad():
-            for loss in losses():
-                with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
-                    found = torch.autograd.grad(loss, parameters)
-                if gradients is None:
-                    gradients = list(found)
-                else:
-                    torch._foreach_add_(gradients, found)
-                total = total + loss.detach()
-        ctx.gradients = gradients
-        return total
+    def forward(ctx, shares: Sequence[Share], totals: Parts, *parameters: Tensor) -> Tensor:
+        shares = [share for share in shares if share]
+        found = side_by_side(lambda share: _differentiated(share, parameters), shares)
+        (sums, ctx.gradients), *others = found
+        totals.update(sums)
+        for sums, gradients in others:
+            torch._foreach_add_(ctx.gradients, gradients)
+            for name, part in sums.items():
+                totals[name] = totals[name] + part
+        return torch.stack(tuple(totals.values())).sum()
 
     @staticmethod
     def backward(ctx, by_loss: Tensor):
-        return None, *torch._foreach_mul(ctx.gradients, by_loss)
+        return None, None, *torch._foreach_mul(ctx.gradients, by_loss)
+
+
+def _differentiated(share: Share, parameters: Sequence[Tensor]) -> tuple[Parts, list[Tensor]]:
+    """Sums of the parts of the loss over pieces, and its gradient."""
+    totals: Parts = {}
+    gradients: list[Tensor] = []
+    for parts_of_piece in share:
+        with torch.enable_grad():
+            parts = parts_of_piece()
+            loss = torch.stack(tuple(parts.values())).sum()
+        with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
+            found = torch.autograd.grad(loss, parameters)
+        if gradients:
+            torch._foreach_add_(gradients, found)
+        else:
+            gradients = list(found)
+        for name, part in parts.items():
+            totals[name] = totals.get(name, 0) + part.detach()
+    return totals, gradients

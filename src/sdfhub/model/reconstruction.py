@@ -15,6 +15,7 @@ from sdfhub.model.observed import Problem, Rows, rows_of, violation
 from sdfhub.model.prior import Prior
 from sdfhub.model.similarity import PoseRange, Similarity, small_similarity
 from sdfhub.shapes import Observation
+from sdfhub.side_by_side import side_by_side
 
 TOGETHER = 64
 """Training codes compared at a time with what was observed."""
@@ -119,10 +120,11 @@ class MapFit:
             problem = Problem(decoder, self.prior(codes), self.delta, poses)
             weights = self.weight, self.weight_partial
             rows = rows_of(observations, self.smallest, weights, codes.device)
-            # a CPU is as fast with one shape at a time, and then no neighbour changes even a rounding
-            together = 1 if codes.device.type == "cpu" else len(observations)
-            groups = [slice(first, first + together) for first in range(0, len(observations), together)]
-            return joined([self._fit(problem, codes, rows.of(group)) for group in groups])
+            if codes.device.type != "cpu":
+                return self._fit(problem, codes, rows)
+            # a core is as fast with one shape at a time, and then no neighbour changes even a rounding
+            shapes = [slice(shape, shape + 1) for shape in range(len(observations))]
+            return joined(side_by_side(lambda shape: self._fit(problem, codes, rows.of(shape)), shapes))
 
     def _fit(self, problem: Problem, codes: Tensor, rows: Rows) -> Fitted:
         shapes = len(rows.soft)

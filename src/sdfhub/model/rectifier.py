@@ -8,18 +8,19 @@ import numba
 import numpy as np
 import torch
 
+from sdfhub.model.dropout import random_words
 from sdfhub.model.loops import (
-    FAST,
     ROWS,
     chunks,
+    compiled,
     flat,
     flat_beside,
     flat_shift,
     narrowed,
     over_points,
     result_dtype,
+    run,
     widened,
-    with_threads,
 )
 
 _f, _u = np.float32, np.uint32
@@ -55,7 +56,7 @@ class Rectifier(torch.autograd.Function):
         drops = (_u(round(dropout * 2**32)), _seed()) if dropout else (None, None)
         ctx.factor, ctx.width = 1 / (1 - dropout), width
         results = flat(value), None if slope is None else flat(slope)
-        with_threads(_forward, *given, *drops, _f(ctx.factor), *results)
+        run(_forward, product, *given, *drops, _f(ctx.factor), *results)
         ctx.save_for_backward(product, shift, value)
         if slope is None:
             return value
@@ -73,12 +74,12 @@ class Rectifier(torch.autograd.Function):
         by_product = product.new_empty(product.shape)
         by_shift = torch.empty(chunks(product), ctx.width)
         given = flat(value), product.shape[1], _f(ctx.factor), flat(by_value)
-        with_threads(_backward, *given, flat(by_product), by_shift.numpy())
+        run(_backward, product, *given, flat(by_product), by_shift.numpy())
         return by_product, over_points(by_shift, shift), by_beside, None, None
 
 
 def _seed() -> np.uint32:
-    return _u(torch.empty((), dtype=torch.int64).random_(2**32).item())
+    return _u(random_words(1).item() % 2**32)
 
 
 @numba.njit(inline="always")
@@ -90,10 +91,10 @@ def _random(place, seed):
     return _u(x ^ (x >> _u(16)))
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
-def _forward(product, shift, points, beside, threshold, seed, factor, value, slope):
+@compiled
+def _forward(some, product, shift, points, beside, threshold, seed, factor, value, slope):
     per_shape, width = -(-points // ROWS), product.shape[1]
-    for chunk in numba.prange(product.shape[0] // points * per_shape):
+    for chunk in range(some[0], some[1]):
         shape, part = chunk // per_shape, chunk % per_shape
         line = shape if len(shift) > 1 else 0
         for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
@@ -110,10 +111,10 @@ def _forward(product, shift, points, beside, threshold, seed, factor, value, slo
                     value[p, width + j] = beside[p, j]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
-def _backward(value, points, factor, by_value, by_product, by_shift):
+@compiled
+def _backward(some, value, points, factor, by_value, by_product, by_shift):
     per_shape, width = -(-points // ROWS), by_product.shape[1]
-    for chunk in numba.prange(len(by_product) // points * per_shape):
+    for chunk in range(some[0], some[1]):
         shape, part = chunk // per_shape, chunk % per_shape
         by_shift[chunk] = 0
         for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):

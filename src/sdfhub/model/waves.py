@@ -18,14 +18,15 @@ from sdfhub.model.loops import (
     FAST,
     ROWS,
     chunks,
+    compiled,
     flat,
     flat_beside,
     flat_shift,
     narrowed,
     over_points,
     result_dtype,
+    run,
     widened,
-    with_threads,
 )
 
 _f = np.float32
@@ -59,7 +60,7 @@ class Wave(torch.autograd.Function):
         slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
         to_copy = flat_beside(beside, product)
         results = flat(value), flat(slope) if with_slope else None
-        with_threads(_forward, *_given(ctx, product, shift, log_beta), to_copy, *results)
+        run(_forward, product, *_given(ctx, product, shift, log_beta), to_copy, *results)
         return (value, slope) if with_slope else value
 
     @staticmethod
@@ -74,7 +75,7 @@ class Wave(torch.autograd.Function):
         by_shift, by_log_beta = torch.empty(2, chunks(product), width)
         cotangents = flat(by_value), None if by_slope is None else flat(by_slope)
         results = flat(by_product), by_shift.numpy(), by_log_beta.numpy()
-        with_threads(_backward, *_given(ctx, product, shift, log_beta), *cotangents, *results)
+        run(_backward, product, *_given(ctx, product, shift, log_beta), *cotangents, *results)
         by_log_beta = None if log_beta is None else by_log_beta.sum()
         return by_product, over_points(by_shift, shift), by_log_beta, by_beside, None, None, None
 
@@ -117,10 +118,10 @@ def _tanh(x):
     return x * over / (_f(1) + s * (_f(0.4669068) + s * under))
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
-def _forward(product, shift, points, omega, beta, beside, value, slope):
+@compiled
+def _forward(some, product, shift, points, omega, beta, beside, value, slope):
     per_shape = -(-points // ROWS)
-    for chunk in numba.prange(product.shape[0] // points * per_shape):
+    for chunk in range(some[0], some[1]):
         shape, part = chunk // per_shape, chunk % per_shape
         line = shape if len(shift) > 1 else 0
         for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
@@ -138,12 +139,14 @@ def _forward(product, shift, points, omega, beta, beside, value, slope):
                     value[p, product.shape[1] + j] = beside[p, j]
 
 
-@numba.njit(parallel=True, fastmath=FAST, cache=True)
-def _backward(product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta):
+@compiled
+def _backward(
+    some, product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta
+):
     # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
     # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
     per_shape = -(-points // ROWS)
-    for chunk in numba.prange(product.shape[0] // points * per_shape):
+    for chunk in range(some[0], some[1]):
         shape, part = chunk // per_shape, chunk % per_shape
         line = shape if len(shift) > 1 else 0
         by_shift[chunk], by_log_beta[chunk] = 0, 0

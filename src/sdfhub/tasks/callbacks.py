@@ -16,6 +16,7 @@ from sdfhub.geometry.mesher import sdf_slice
 from sdfhub.geometry.metrics import judge
 from sdfhub.geometry.render import render, slice_image
 from sdfhub.model.autodecoder import AutoDecoder
+from sdfhub.model.computing import distances
 from sdfhub.space import reconstruct
 
 TENSORBOARD_VERTICES = 60_000
@@ -162,7 +163,11 @@ class MeshShapes(L.Callback):
             writer.add_image(
                 f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step, dataformats="HWC"
             )
-        grid = sdf_slice(lambda x: module.decoder(x[None], code[None])[0], axis=0, device=code.device)
+
+        def field(points: torch.Tensor) -> torch.Tensor:
+            return distances(module.decoder, points[None], code[None])[0]
+
+        grid = sdf_slice(field, axis=0, device=code.device)
         grid = grid if shape.up == "z" else grid[:, ::-1].T  # rows run along the picture's right, z or -z
         writer.add_image(
             f"{shape.id}/slice_x0", slice_image(grid, module.loss.delta), step, dataformats="HWC"

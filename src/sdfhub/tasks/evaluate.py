@@ -23,6 +23,7 @@ from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import Judge
+from sdfhub.model.computing import distances
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fitting import Fit
 from sdfhub.shapes import NormalizedMesh
@@ -40,9 +41,6 @@ WORTH_A_PROCESS = 4
 NOISE = 64
 """Faces, in squared resolutions, above which a mesh is noise: ten times those of the unit sphere. What a
 training that diverged leaves crosses zero in every cell: it is no surface, and would take gigabytes."""
-
-BATCH = 2**16
-"""Points a call when signed distances are judged; bounds memory, not the result."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,7 @@ def distance_errors(decoder: Decoder, code: Tensor, shape: StoredShape, delta: f
     for part, name in zip(np.split(drawn, [counts["outside"]]), counts, strict=True):
         draw_rows(part, shape, name, rng)
     rows = torch.from_numpy(drawn).to(code.device)
-    field = torch.cat([decoder(part[None, :, :3], code[None])[0] for part in rows.split(BATCH)])
+    field = distances(decoder, rows[None, :, :3], code[None])[0]
     near = rows[:, 3].abs() < delta
     return {
         "sdf_error": float((field - rows[:, 3]).abs()[near].mean()),

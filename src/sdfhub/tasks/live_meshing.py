@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
+from sdfhub.model.computing import distances
 from sdfhub.model.decoder import Decoder
 
 
@@ -87,7 +88,7 @@ class LiveMesher:
             def fields(points: Tensor, shapes: Tensor, is_first: bool = index == 0) -> Tensor:
                 if not is_first and (self._latest is not None or not self._is_open):
                     raise _Outdated
-                return self.decoder(points, code[None].expand(len(shapes), -1))
+                return distances(self.decoder, points, code[None].expand(len(shapes), -1))
 
             mesh = next(mesh_fields(fields, 1, resolution, device=code.device))
             self.show(Meshed(about, mesh, resolution, time.perf_counter() - asked))

@@ -1,0 +1,75 @@
+"""Parts of a computation that need nothing of one another, side by side on the cores of a processor.
+
+PyTorch spreads every operation over its threads, which wait for one another after each: hundreds of times in
+a training step. Whole parts wait once, at the end. Each is computed by one thread alone.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from functools import cache
+from threading import Barrier
+from typing import TypeVar
+
+import torch
+
+Item, Result = TypeVar("Item"), TypeVar("Result")
+
+
+def side_by_side(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """`work` of every item, in order, on as many threads as PyTorch has here; its modes are the caller's.
+
+    Where there is one thread or one item, and inside of `work`, it is a plain loop.
+
+    Raises:
+        whatever the first item to fail raises; those not begun are left out.
+    """
+    threads = torch.get_num_threads()
+    if min(threads, len(items)) < 2:
+        return [work(item) for item in items]
+    call = _in_modes_of_here(work)
+    futures = [_pool(threads).submit(call, item) for item in items]
+    try:
+        wait(futures, return_when=FIRST_EXCEPTION)
+    finally:
+        for future in futures:
+            future.cancel()
+    wait(futures)
+    failed = [future for future in futures if not future.cancelled() and future.exception()]
+    return [future.result() for future in failed or futures]
+
+
+def _in_modes_of_here(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """`work` in the modes of the calling thread: threads do not inherit them."""
+    gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    dtype, autocast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
+
+    def call(item: Item) -> Result:
+        with (
+            torch.inference_mode(inference),
+            torch.set_grad_enabled(gradients),
+            torch.autocast("cpu", dtype, enabled=autocast),
+        ):
+            return work(item)
+
+    return call
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that each compute alone."""
+    everyone = Barrier(threads + 1)
+    pool = ThreadPoolExecutor(threads, "side_by_side", initializer=_compute_alone)
+    for _ in range(threads):
+        pool.submit(everyone.wait)
+    everyone.wait()
+    torch.set_num_threads(threads)  # the last call anywhere is what later threads begin with
+    return pool
+
+
+def _compute_alone() -> None:
+    torch.get_num_threads()  # the first call in a thread takes the number of others, whatever was set before
+    torch.set_num_threads(1)
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of the threads
