@@ -12,9 +12,9 @@ _GENERATOR: ContextVar[torch.Generator | None] = ContextVar("dropout", default=N
 
 
 @contextmanager
-def drawn_from(seed: int) -> Iterator[None]:
-    """On the CPU dropout in here, in this thread, is a function of the seed."""
-    token = _GENERATOR.set(torch.Generator().manual_seed(seed))
+def drawn_from(seed: int | None) -> Iterator[None]:
+    """On the CPU dropout in here, in this thread, is a function of the seed; None: as outside."""
+    token = _GENERATOR.set(_GENERATOR.get() if seed is None else torch.Generator().manual_seed(seed))
     try:
         yield
     finally:

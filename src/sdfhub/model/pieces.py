@@ -68,13 +68,15 @@ def loss_in_pieces(
         parts = parts_of(batch)
         return torch.stack(tuple(parts.values())).sum(), parts
 
-    def weighted(piece: Batch, of_samples: float, of_normals: float, seed: int) -> Parts:
+    def weighted(piece: Batch, of_samples: float, of_normals: float, seed: int | None) -> Parts:
         with drawn_from(seed):
             parts = parts_of(piece)
         return {name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()}
 
     cut = list(pieces(batch, points))
-    seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()  # here, in order: threads take turns as they like
+    seeds = [None] * len(cut)
+    if batch.sdf.is_cpu:  # here, in order: threads take turns as they like
+        seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()
     each = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
     totals: Parts = {}
     return _Summed.apply([each[thread::threads] for thread in range(threads)], totals, *parameters), totals
