@@ -1,5 +1,13 @@
-"""DeepSDF's published training step, written anew from its description: its network, loss and data path."""
+"""DeepSDF's published training step, written anew from its description: its network, loss and data path.
 
+    python benchmarks/reference.py THREADS SAMPLES FILE.npz ...
+
+makes a step at each line of input and answers with a line. So run it is what DeepSDF's users run: a process
+of its own, with PyTorch as it comes, which knows nothing of sdfhub and what that does to memory and threads.
+"""
+
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,3 +85,39 @@ class ReferenceStep:
             loss = loss + 1e-4 * codes.norm(dim=1).sum() / len(rows)
             loss.backward()
         self.optimizer.step()
+
+
+class ReferenceProcess:
+    """The step in a process of its own. It sleeps between its steps."""
+
+    def __init__(self, files: list[Path], samples: int, threads: int):
+        command = [sys.executable, __file__, str(threads), str(samples), *map(str, files)]
+        self.bf16 = False
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def __call__(self) -> None:
+        """Makes a step.
+
+        Raises:
+            RuntimeError: the process has ended.
+        """
+        print(file=self.process.stdin, flush=True)
+        if not self.process.stdout.readline():
+            raise RuntimeError("the process of DeepSDF's step has ended; above is what it said")
+
+    def close(self) -> None:
+        """Ends the process."""
+        self.process.communicate()
+
+
+def answer(threads: str, samples: str, *files: str) -> None:
+    """Makes a step whenever it is asked to."""
+    torch.set_num_threads(int(threads))
+    step = ReferenceStep([Path(file) for file in files], int(samples), torch.device("cpu"))
+    for _ in sys.stdin:
+        step()
+        print("done", flush=True)
+
+
+if __name__ == "__main__":
+    answer(*sys.argv[1:])

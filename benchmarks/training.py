@@ -3,15 +3,16 @@
     python benchmarks/training.py [--shapes 4] [--samples 4096] [--rounds 5] [--threads N] [overrides]
     python benchmarks/training.py --device cuda --shapes 64 --samples 16384
 
-Every round times one step of each rival, one after the other, so that a machine's moods hit all alike;
-printed are medians over the rounds, after three that warm up, and how far the slowest and the fastest are
-apart. DeepSDF's step (reference.py) is re-implemented from its description: its network (weight norm, dropout
-0.2, the code concatenated to every point), its sum of clamped L1 over the batch, its prior |z|, Adam, and its
-data path, one npz file a shape read anew at every step. It computes in float32; a second one has bfloat16
-products, so that steps of ours that have them can be compared with their like. Steps of ours include the draw
-of their samples from the store. Only samples with a signed distance are counted: what normals cost is on our
-account. The limit is the rate of a product [points worked on together, W] x [W, W], W the width of the
-decoder, timed in the same rounds.
+Every round times one step of each rival, after one that warms up, one rival after the other, so that a
+machine's moods hit all alike; printed are medians over the rounds, after two that do not count, and how far
+the slowest and the fastest are apart. DeepSDF's step (reference.py) is re-implemented from its description:
+its network (weight norm, dropout 0.2, the code concatenated to every point), its sum of clamped L1 over the
+batch, its prior |z|, Adam, and its data path, one npz file a shape read anew at every step. It runs in a
+process of its own, as its users run it. Two more run in this process and so have its settings of memory and
+threads, which are ours: one like it, one with bfloat16 products, which DeepSDF does not have, so that steps
+of ours can be compared with their like. Steps of ours include the draw of their samples from the store. Only
+samples with a signed distance are counted: what normals cost is on our account. The limit is the rate of a
+product [8192, W] x [W, W] on each core, W the width of the decoder, timed in the same rounds.
 
 On a GPU our samples lie in its memory and the decoder is compiled, as `trainer=gpu` does it; DeepSDF's step
 is given samples that wait on the device, as if its loaders took no time, and works on a batch in four parts
@@ -38,7 +39,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
-from reference import ReferenceStep
+from reference import ReferenceProcess, ReferenceStep
 
 from sdfhub.data.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.resident import ResidentBatches
@@ -51,9 +52,9 @@ from sdfhub.tasks.run import build_autodecoder
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STORED = 100_000
 """Samples of each kind in a shape's file; a draw does not depend on what they are."""
-WARM_UP = 3
-"""Rounds that do not count: the reference is a fifth slower until freed memory is of the right sizes."""
-REFERENCE = "DeepSDF, reference"
+WARM_UP = 2
+"""Rounds that do not count: the reference here is a fifth slower until freed memory is of the right sizes."""
+PUBLISHED, REFERENCE = "DeepSDF, as published", "DeepSDF, in our process"
 UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "search", "sweeps", "hydra")
 """Groups of a training that a step without data, judging or a loop around it does not read."""
 PAPER_SAMPLES = 2000 * 16_384
@@ -215,6 +216,8 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     rows = args.shapes * args.samples
     device = torch.device(args.device)
     made: dict[str, object] = {}
+    if device.type == "cpu":
+        made[PUBLISHED] = ReferenceProcess(files, args.samples, torch.get_num_threads())
     for bf16 in (False, True):
         suffix = ", bf16" if bf16 else ""
         made |= {
@@ -273,7 +276,7 @@ def main() -> None:
     if args.threads:
         torch.set_num_threads(args.threads)
     register_resolvers()
-    keep_freed_memory()  # for the reference too
+    keep_freed_memory()  # for the references here too
     torch._dynamo.config.recompile_limit = 64  # each decoder is a version; else late ones run plain
     torch.manual_seed(0)
     with (
@@ -288,16 +291,18 @@ def main() -> None:
                 taken = seconds_of(step, args.device == "cuda")
                 if round_ >= WARM_UP:
                     times[name].append(taken)
+        if PUBLISHED in steps:
+            steps[PUBLISHED].close()
     report(args, steps, limits, times)
 
 
 def seconds_of(step, on_gpu: bool) -> float:
-    """How long a step takes; on a GPU the mean of ten after one, as the first may compile."""
+    """How long a step takes after another, which may compile; on a GPU the mean of ten."""
+    step()
     if not on_gpu:
         start = time.perf_counter()
         step()
         return time.perf_counter() - start
-    step()
     torch.cuda.synchronize()
     start = time.perf_counter()
     for _ in range(10):
@@ -337,9 +342,10 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str,
         print(f"copy: {copy.bytes() / seconds['copy'] / 1e9:.0f} GB a second, read and written")
     memory = " | of the copy's" if copy else ""
     print(
-        f"\n| step | samples/s | apart | times DeepSDF | in bf16 too | share of the product's rate{memory} |"
+        "\n| step | samples/s | apart | times DeepSDF | in our process | and in bf16 "
+        f"| share of the product's rate{memory} |"
     )
-    print("| --- " * (6 + bool(copy)) + "|")
+    print("| --- " * (7 + bool(copy)) + "|")
     for name, step in steps.items():
         shares = [0.0] * (1 + bool(copy))
         if hasattr(step, "operations"):
@@ -347,10 +353,13 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str,
         if copy and hasattr(step, "bytes"):
             shares[1] = step.bytes() / seconds[name] / (copy.bytes() / seconds["copy"])
         apart = (max(times[name]) - min(times[name])) / seconds[name]
-        faster = ["", ""]
+        faster = ["", "", ""]
         if not isinstance(step, OurField):
-            faster[0] = f"{seconds[REFERENCE] / seconds[name]:.2f}"
-            faster[1] = f"{seconds[f'{REFERENCE}, bf16'] / seconds[name]:.2f}" if step.bf16 else ""
+            others = [PUBLISHED, REFERENCE, *([f"{REFERENCE}, bf16"] if step.bf16 else [])]
+            compared = [
+                f"{seconds[other] / seconds[name]:.2f}" if other in seconds else "" for other in others
+            ]
+            faster[: len(compared)] = compared
         cells = " | ".join([*faster, *(f"{share:.2f}" if share else "" for share in shares)])
         print(f"| {name} | {rows / seconds[name]:,.0f} | {apart:.0%} | {cells} |")
     for bf16 in ("", ", bf16"):
