@@ -6,6 +6,7 @@ makes a step at each line of input and answers with a line. So run it is what De
 of its own, with PyTorch as it comes, which knows nothing of sdfhub and what that does to memory and threads.
 """
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -93,17 +94,21 @@ class ReferenceProcess:
     def __init__(self, files: list[Path], samples: int, threads: int):
         command = [sys.executable, __file__, str(threads), str(samples), *map(str, files)]
         self.bf16 = False
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # sdfhub has set this one when it was imported, and a child would inherit it
+        plain = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+        self.process = subprocess.Popen(
+            command, env=plain, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
 
     def __call__(self) -> None:
         """Makes a step.
 
         Raises:
-            RuntimeError: the process has ended.
+            OSError: the process has ended.
         """
         print(file=self.process.stdin, flush=True)
         if not self.process.stdout.readline():
-            raise RuntimeError("the process of DeepSDF's step has ended; above is what it said")
+            raise BrokenPipeError("the process of DeepSDF's step has ended; what it said stands above")
 
     def close(self) -> None:
         """Ends the process."""

@@ -105,7 +105,7 @@ def test_a_fit_finds_balls_from_samples_and_from_surfaces(decoder):  # noqa: F81
     assert found.poses is None and (found.residuals < 0.02).all()
 
 
-def test_targets_fitted_together_get_what_they_get_alone(decoder):  # noqa: F811
+def test_targets_fitted_together_get_what_they_get_alone(decoder, several):  # noqa: F811
     seen, fit = [ball(0.45), ball(0.52, noise=0.01)], MapFit(**MAP)
     together = fit(decoder, CODES, seen)
     for row, one in enumerate(seen):

@@ -1,9 +1,11 @@
 """Threads that compute alone: what they find is what one thread finds, and nobody else notices them."""
 
+import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from sdfhub.model.computing import Computing, distances
 from sdfhub.model.dropout import drawn_from, kept
 from sdfhub.model.fitting import GaussNewtonFit
 from sdfhub.model.loops import ALONE
-from sdfhub.side_by_side import side_by_side
+from sdfhub.side_by_side import _pool, side_by_side
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed
 from tests.test_fitting import NEWTON, draws
@@ -23,7 +25,7 @@ from tests.test_training import batches
 
 FORKED = """
 import os, torch
-from sdfhub.side_by_side import side_by_side
+from sdfhub.side_by_side import _pool, side_by_side
 torch.set_num_threads(2)
 work = lambda number: number + 1
 assert side_by_side(work, range(4)) == [1, 2, 3, 4]
@@ -32,15 +34,6 @@ if child == 0:
     os._exit(0 if side_by_side(work, range(4)) == [1, 2, 3, 4] else 1)
 assert os.waitpid(child, 0)[1] == 0
 """
-
-
-@pytest.fixture(params=[2, 3])
-def several(request):
-    """As many threads for PyTorch."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
 
 
 def alone(call):
@@ -67,6 +60,7 @@ def test_results_are_in_order_and_each_is_computed_by_one_of_several_threads(sev
 
 
 def test_the_callers_number_of_threads_and_that_of_later_threads_stay(several):
+    _pool.cache_clear()
     side_by_side(lambda _: None, range(4))
     later = []
     thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
@@ -109,6 +103,49 @@ def test_the_first_failure_is_raised_and_work_not_begun_is_left_out(several):
         side_by_side(work, range(100))
     assert len(begun) < 100
     assert side_by_side(abs, [-1, 2, -3]) == [1, 2, 3]
+
+
+def test_several_callers_share_the_threads(several):
+    with ThreadPoolExecutor(4) as callers:
+        found = list(callers.map(lambda first: side_by_side(abs, range(first, 0)), range(-9, -1)))
+    assert found == [list(range(-first, 0, -1)) for first in range(-9, -1)]
+
+
+def test_where_the_system_has_no_more_threads_nothing_is_left_waiting(several, monkeypatch):
+    _pool.cache_clear()
+    start, started = threading.Thread.start, []
+
+    def once(self):
+        started.append(self)
+        if len(started) > 1:
+            raise RuntimeError("can't start new thread")
+        start(self)
+
+    monkeypatch.setattr(threading.Thread, "start", once)
+    with pytest.raises(RuntimeError, match="can't start"):
+        side_by_side(abs, range(4))
+    monkeypatch.undo()
+    started[0].join(timeout=30)
+    assert not started[0].is_alive() and torch.get_num_threads() == several
+    assert side_by_side(abs, [-1, -2]) == [1, 2]
+
+
+def test_an_interruption_leaves_no_thread_at_work(several):
+    """As Ctrl-C comes: in the calling thread, while it waits."""
+    ended = []
+
+    def work(number: int) -> None:
+        time.sleep(0.5)
+        ended.append(number)
+
+    timer = threading.Timer(0.2, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(work, range(100))
+    count = len(ended)
+    assert 0 < count < 100
+    time.sleep(0.7)
+    assert len(ended) == count
 
 
 def test_a_forked_process_has_threads_of_its_own():
@@ -188,5 +225,6 @@ def test_shapes_fitted_side_by_side_have_the_codes_that_each_has_alone(several):
     decoder, fit = small_decoder(width=32), GaussNewtonFit(**NEWTON)
     radii = np.linspace(0.4, 0.55, 5)
     together = fit(decoder, draws(*radii), range(5))
-    each = alone(lambda: fit(decoder, draws(*radii), range(5)))
-    torch.testing.assert_close(together, each)
+    each = [fit(decoder, draws(radius), [seed]) for seed, radius in enumerate(radii)]
+    assert torch.equal(together, torch.cat(each))
+    assert torch.equal(together, alone(lambda: fit(decoder, draws(*radii), range(5))))

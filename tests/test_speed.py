@@ -18,6 +18,7 @@ from sdfhub.model.activations import Activation, Hosc, Relu, Siren, joined
 from sdfhub.model.computing import Computing
 from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
+from sdfhub.model.loops import ALONE
 from sdfhub.model.pieces import loss_in_pieces, pieces
 from sdfhub.shapes import Batch
 from tests.test_model import ACTIVATIONS as CHOICES
@@ -131,13 +132,13 @@ def test_numbers_that_are_not_finite_stay_so():
     assert value[0, 0, 0].isnan() and value[0, 0, 1] == float("inf") and value[0, 0, 2] == 1
 
 
-def test_the_loops_leave_pytorchs_threads_alone_and_take_callers_from_several_threads():
-    threads = torch.get_num_threads()
-    product, shift = products()
+def test_the_loops_take_callers_from_several_threads(several):
+    product, shift = products(points=3000)
+    assert product.numel() > ALONE
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: Siren(15.0, 3.0).shifted(product, shift), range(16)))
     assert all(torch.equal(value, found[0]) for value in found)
-    assert torch.get_num_threads() == threads
+    assert torch.get_num_threads() == several
 
 
 def test_the_loops_gradient_can_be_differentiated_again():

@@ -3,7 +3,7 @@
 import os
 from typing import Any
 
-# PyTorch's threads would keep a core busy for milliseconds after their work, and numba's wait for it
+# PyTorch's threads would keep a core busy for milliseconds after their work, while others wait for it
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 from sdfhub.data.sampling import Preparation, prepare_mesh

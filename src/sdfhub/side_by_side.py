@@ -20,25 +20,33 @@ _FIRST = Lock()
 once, one had sines good to a ten-thousandth, once in some hundred processes."""
 
 
-def side_by_side(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """`work` of every item, in order, on as many threads as PyTorch has here; its modes are the caller's.
+def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: int = 2) -> list[Result]:
+    """`work` of every item, in order, on as many threads as PyTorch has here.
 
-    Where there is one thread or one item, and inside of `work`, it is a plain loop.
+    Gradients, inference mode and autocast are on or off as for the caller. Where there is one thread, and
+    inside of `work`, it is a plain loop.
+
+    Args:
+        work: called from several threads at once.
+        items: what it is called with.
+        least: items that are worth it; fewer are a plain loop, in which an operation has all threads. With 1
+            a result does not depend, not even by rounding, on how many items there are.
 
     Raises:
-        whatever the first item to fail raises; those not begun are left out.
+        whatever the first item to fail raises; those not begun are left out. When this returns or raises,
+            no thread is at work.
     """
     threads = torch.get_num_threads()
-    if min(threads, len(items)) < 2:
+    if threads < 2 or len(items) < least:
         return [work(item) for item in items]
-    call = _in_modes_of_here(work)
-    futures = [_pool(threads).submit(call, item) for item in items]
+    call, pool = _in_modes_of_here(work), _pool(threads)
+    futures = [pool.submit(call, item) for item in items]
     try:
         wait(futures, return_when=FIRST_EXCEPTION)
     finally:
         for future in futures:
             future.cancel()
-    wait(futures)
+        wait(futures)
     failed = [future for future in futures if not future.cancelled() and future.exception()]
     return [future.result() for future in failed or futures]
 
@@ -61,22 +69,44 @@ def _in_modes_of_here(work: Callable[[Item], Result]) -> Callable[[Item], Result
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that each compute alone."""
+    """Threads that each compute alone.
+
+    Raises:
+        RuntimeError: the system has no more of them.
+    """
     everyone = Barrier(threads + 1)
-    pool = ThreadPoolExecutor(threads, "side_by_side", initializer=_compute_alone)
-    for _ in range(threads):
-        pool.submit(everyone.wait)
-    everyone.wait()
-    torch.set_num_threads(threads)  # the last call anywhere is what later threads begin with
+    pool = ThreadPoolExecutor(threads, "side_by_side", initializer=_compute_alone, initargs=(everyone,))
+    try:
+        for _ in range(threads):
+            pool.submit(everyone.wait)
+        everyone.wait()
+    except BaseException:  # those that have begun must not wait for the others for ever
+        everyone.abort()
+        pool.shutdown(wait=False)
+        raise
+    finally:
+        torch.set_num_threads(threads)  # the last call anywhere is what later threads begin with
     return pool
 
 
-def _compute_alone() -> None:
-    torch.get_num_threads()  # the first call in a thread takes the number of others, whatever was set before
-    torch.set_num_threads(1)
-    with _FIRST:
-        for function in (torch.sin, torch.cos, torch.exp, torch.tanh):
-            function(torch.ones(64))
+def _compute_alone(everyone: Barrier) -> None:
+    try:
+        torch.get_num_threads()  # a thread's first call takes the number of others, whatever was set before
+        torch.set_num_threads(1)
+        with _FIRST:
+            for function in (torch.sin, torch.cos, torch.exp, torch.tanh):
+                function(torch.ones(64))
+    except BaseException:
+        everyone.abort()
+        raise
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of the threads
+def _begin_anew() -> None:
+    """A forked process has none of the threads, and nobody who would release a lock."""
+    global _FIRST
+    _FIRST = Lock()
+    _pool.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_begin_anew)

@@ -153,8 +153,9 @@ def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
         points: [B, N, 3], normalised frame.
         codes: [B, L].
     """
-    together = Computing().together(points.device, points.shape[0] * points.shape[1])
-    parts = points.split(max(1, together // len(points)), dim=1)
+    samples = points.shape[0] * points.shape[1]
+    count = -(-samples // Computing().together(points.device, samples))
+    parts = points.tensor_split(min(count, points.shape[1]), dim=1)
     in_turn = side_by_side if points.is_cpu else map
     return torch.cat([*in_turn(lambda part: decoder(part, codes), parts)], dim=1)
 

@@ -13,7 +13,10 @@ _GENERATOR: ContextVar[torch.Generator | None] = ContextVar("dropout", default=N
 
 @contextmanager
 def drawn_from(seed: int | None) -> Iterator[None]:
-    """On the CPU dropout in here, in this thread, is a function of the seed; None: as outside."""
+    """On the CPU dropout in here, in this thread, is a function of the seed; None: as outside.
+
+    What is compiled draws from PyTorch's generator, here as elsewhere.
+    """
     token = _GENERATOR.set(_GENERATOR.get() if seed is None else torch.Generator().manual_seed(seed))
     try:
         yield

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.gauss_newton import Quadratic, descend
+from sdfhub.model.gauss_newton import Quadratic, descend, values_and_jacobian
 from sdfhub.model.losses import clamped_l1
 from sdfhub.side_by_side import side_by_side
 
@@ -24,7 +24,7 @@ Draw = Callable[[int], tuple[Tensor, Tensor]]
 """Step number -> points [B, N, 3] and sdf [B, N], the next samples of B shapes."""
 
 ROWS = 2**14
-"""Samples differentiated at a time by Gauss-Newton, or one shape's; bounds memory."""
+"""Samples that Gauss-Newton looks at together, or one shape's; bounds memory."""
 
 
 class Fit(Protocol):
@@ -144,9 +144,9 @@ class GaussNewtonFit:
             drawn = (tensor.to(start.device) for tensor in draw(0))
             if start.device.type != "cpu":
                 return self._fit(decoder, start, *drawn)
-            # a core is as fast with one shape at a time, and then no neighbour changes even a rounding
+            # a thread a shape: then no neighbour changes even a rounding
             shapes = zip(start.split(1), *(tensor.split(1) for tensor in drawn), strict=True)
-            return torch.cat(side_by_side(lambda shape: self._fit(decoder, *shape), list(shapes)))
+            return torch.cat(side_by_side(lambda shape: self._fit(decoder, *shape), list(shapes), least=1))
 
     def _fit(self, decoder, codes: Tensor, points: Tensor, sdf: Tensor) -> Tensor:
         damping = torch.full_like(codes[:, 0], self.damping)
@@ -183,17 +183,19 @@ class GaussNewtonFit:
 def field_and_jacobian(decoder: Decoder, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
     """Signed distances [B, N] and their derivatives by the code [B, N, L].
 
-    Each sample carries a copy of its shape's code, so that one backward pass gives every row.
+    Each sample carries a copy of its shape's code.
 
     Args:
         points: [B, N, 3], normalised frame.
         codes: [B, L].
     """
-    with torch.enable_grad():
-        copies = codes.repeat_interleave(points.shape[1], 0).requires_grad_()
-        field = decoder(points.reshape(-1, 1, 3), copies).reshape(points.shape[:2])
-        (jacobian,) = torch.autograd.grad(field.sum(), copies)
-    return field.detach(), jacobian.unflatten(0, points.shape[:2])
+
+    def field_of(copies: Tensor, each: Tensor) -> Tensor:
+        return decoder(each, copies)[:, 0]
+
+    copies = codes.repeat_interleave(points.shape[1], 0)
+    field, jacobian = values_and_jacobian(field_of, copies, points.reshape(-1, 1, 3))
+    return field.reshape(points.shape[:2]), jacobian.unflatten(0, points.shape[:2])
 
 
 def initial_codes(decoder: Decoder, spread: float, seeds: Sequence[int]) -> Tensor:

@@ -21,8 +21,33 @@ class Quadratic(NamedTuple):
     hessian: Tensor
 
 
+AT_ONCE = 2**12
+"""Rows differentiated at a time on a CPU, by each thread; bounds memory."""
+
 About = Callable[[Tensor, Tensor], Quadratic]
 """Rows [b] of problems and their unknowns [b, U] -> their objectives there."""
+
+
+def values_and_jacobian(
+    values_of: Callable[..., Tensor], unknowns: Tensor, *given: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Values [R] and their derivatives [R, U] of rows that each depend on unknowns of their own alone.
+
+    So one backward pass gives every row.
+
+    Args:
+        values_of: maps unknowns [r, U] and what is given of as many rows to values [r].
+        unknowns: [R, U].
+        given: [R, ...] each.
+    """
+    size, found = AT_ONCE if unknowns.is_cpu else max(1, len(unknowns)), []
+    for some, *parts in zip(unknowns.split(size), *(each.split(size) for each in given), strict=True):
+        with torch.enable_grad():
+            some = some.detach().requires_grad_()
+            values = values_of(some, *parts)
+            found.append((values.detach(), *torch.autograd.grad(values.sum(), some)))
+    values, jacobian = (torch.cat(column) for column in zip(*found, strict=True))
+    return values, jacobian
 
 
 def descend(

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.gauss_newton import Quadratic
+from sdfhub.model.gauss_newton import Quadratic, values_and_jacobian
 from sdfhub.model.prior import Normal
 from sdfhub.model.similarity import SIZE, PoseRange, small_similarity, turns
 from sdfhub.shapes import Observation
@@ -131,20 +131,20 @@ class Problem:
     def violation_and_jacobian(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor]:
         """Violations [B, N] and their derivatives by the unknowns [B, N, U]; arguments as in `about`.
 
-        Each row carries a copy of its shape's unknowns, so that one backward pass gives every row.
+        Each row carries a copy of its shape's unknowns.
         """
         shapes, count = rows.low.shape
         turned = rows.turned(self.turns[turn])
-        each = Rows(*(part.flatten(0, 1)[:, None] for part in turned[:4]), rows.soft, rows.weight)
-        with torch.enable_grad():
-            copies = unknowns.repeat_interleave(count, 0).requires_grad_()
-            if self.has_pose:
-                pose = small_similarity(copies[:, self.size :])
-                scale = pose.scale[:, None]
-                each = each._replace(
-                    points=pose.moved(each.points), low=each.low * scale, high=each.high * scale
-                )
-            found = violation(self.decoder, copies[:, : self.size], each, self.delta)
-            found = found / scale if self.has_pose else found
-            (jacobian,) = torch.autograd.grad(found.sum(), copies)
-        return found.detach().reshape(shapes, count), jacobian.unflatten(0, (shapes, count))
+
+        def violation_of(copies: Tensor, *each: Tensor) -> Tensor:
+            one = Rows(*each, rows.soft, rows.weight)
+            if not self.has_pose:
+                return violation(self.decoder, copies, one, self.delta)[:, 0]
+            pose = small_similarity(copies[:, self.size :])
+            scale = pose.scale[:, None]
+            one = one._replace(points=pose.moved(one.points), low=one.low * scale, high=one.high * scale)
+            return (violation(self.decoder, copies[:, : self.size], one, self.delta) / scale)[:, 0]
+
+        each = (part.flatten(0, 1)[:, None] for part in turned[:4])
+        found, jacobian = values_and_jacobian(violation_of, unknowns.repeat_interleave(count, 0), *each)
+        return found.reshape(shapes, count), jacobian.unflatten(0, (shapes, count))

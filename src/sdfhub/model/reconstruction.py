@@ -122,9 +122,10 @@ class MapFit:
             rows = rows_of(observations, self.smallest, weights, codes.device)
             if codes.device.type != "cpu":
                 return self._fit(problem, codes, rows)
-            # a core is as fast with one shape at a time, and then no neighbour changes even a rounding
+            # a thread a shape: then no neighbour changes even a rounding
             shapes = [slice(shape, shape + 1) for shape in range(len(observations))]
-            return joined(side_by_side(lambda shape: self._fit(problem, codes, rows.of(shape)), shapes))
+            found = side_by_side(lambda shape: self._fit(problem, codes, rows.of(shape)), shapes, least=1)
+            return joined(found)
 
     def _fit(self, problem: Problem, codes: Tensor, rows: Rows) -> Fitted:
         shapes = len(rows.soft)

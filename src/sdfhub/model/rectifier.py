@@ -1,7 +1,7 @@
 """max(0, x) with dropout on the CPU: one pass over memory forward, one backward.
 
 A unit passes gradients exactly where its output is not 0, so backward needs nothing but the output. Which
-units are dropped is a hash of their place and of a number that PyTorch's generator draws.
+units are dropped is a hash of their place and of a random number.
 """
 
 import numba
