@@ -138,7 +138,8 @@ def test_an_interruption_leaves_no_thread_at_work(several):
         time.sleep(0.5)
         ended.append(number)
 
-    timer = threading.Timer(0.2, signal.raise_signal, [signal.SIGINT])
+    here = threading.get_ident()
+    timer = threading.Timer(0.2, signal.pthread_kill, [here, signal.SIGINT])
     timer.start()
     with pytest.raises(KeyboardInterrupt):
         side_by_side(work, range(100))
