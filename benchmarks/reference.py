@@ -97,7 +97,12 @@ class ReferenceProcess:
         # sdfhub has set this one when it was imported, and a child would inherit it
         plain = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
         self.process = subprocess.Popen(
-            command, env=plain, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            command,
+            env=plain,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C is the benchmark's; this process ends when its input does
         )
 
     def __call__(self) -> None:

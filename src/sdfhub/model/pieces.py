@@ -54,8 +54,8 @@ def loss_in_pieces(
 ) -> tuple[Tensor, Parts]:
     """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
 
-    A batch of more than `points` samples is differentiated at once, piece by piece; `backward`
-    only has to hand the sum over. The plain twin is `parts_of(batch)`.
+    A batch of more than `points` samples is differentiated in here, piece by piece; `backward` only has to
+    hand the sum over. The plain twin is `parts_of(batch)`.
 
     Args:
         parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.
