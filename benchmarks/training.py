@@ -55,7 +55,7 @@ STORED = 100_000
 WARM_UP = 2
 """Rounds that do not count: the reference here is a fifth slower until freed memory is of the right sizes."""
 PUBLISHED, REFERENCE = "DeepSDF, as published", "DeepSDF, in our process"
-BUSY = 1.6
+BUSY = 2.5
 """How much slower than in our process DeepSDF's step is in its own where it waits for other programs."""
 UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "search", "sweeps", "hydra")
 """Groups of a training that a step without data, judging or a loop around it does not read."""
