@@ -25,7 +25,7 @@ from tests.test_training import batches
 
 FORKED = """
 import os, torch
-from sdfhub.side_by_side import _pool, side_by_side
+from sdfhub.side_by_side import side_by_side
 torch.set_num_threads(2)
 work = lambda number: number + 1
 assert side_by_side(work, range(4)) == [1, 2, 3, 4]
@@ -213,10 +213,11 @@ def test_a_batch_is_shared_by_the_threads_until_shares_are_small(several):
 
 
 @pytest.mark.parametrize("shapes", [1, 3])
-def test_distances_in_parts_are_those_of_the_decoder(shapes, several):
+@pytest.mark.parametrize("count", [5003, 1, 0])
+def test_distances_in_parts_are_those_of_the_decoder(shapes, count, several):
     torch.manual_seed(0)
     decoder = small_decoder().eval()
-    points, codes = torch.rand(shapes, 5003, 3) - 0.5, torch.randn(shapes, 4)
+    points, codes = torch.rand(shapes, count, 3) - 0.5, torch.randn(shapes, 4)
     with torch.no_grad():
         torch.testing.assert_close(distances(decoder, points, codes), decoder(points, codes))
 

@@ -155,7 +155,7 @@ def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
     """
     samples = points.shape[0] * points.shape[1]
     count = -(-samples // Computing().together(points.device, samples))
-    parts = points.tensor_split(min(count, points.shape[1]), dim=1)
+    parts = points.tensor_split(max(1, min(count, points.shape[1])), dim=1)
     in_turn = side_by_side if points.is_cpu else map
     return torch.cat([*in_turn(lambda part: decoder(part, codes), parts)], dim=1)
 
