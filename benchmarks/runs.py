@@ -18,8 +18,13 @@ from sdfhub.tasks.wording import one_line
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def train(name: str, *overrides: str) -> dict:
+def train(name: str, *overrides: str, script: str = "train.py") -> dict:
     """The content of `metrics.json` of one run under outputs/benchmarks/<name>; its output goes to stderr.
+
+    Args:
+        name: of the run's folder.
+        overrides: as on a command line.
+        script: that trains, relative to the repository's root.
 
     Raises:
         SdfhubError: the run failed; the message is its own last line.
@@ -28,7 +33,7 @@ def train(name: str, *overrides: str) -> dict:
     shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
     command = [
         sys.executable,
-        "train.py",
+        script,
         *overrides,
         f"hydra.run.dir={folder}",
         "trainer.enable_progress_bar=false",
