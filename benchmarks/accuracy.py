@@ -40,14 +40,19 @@ def main() -> None:
     print(f"| {' | '.join(titles)} |\n{'| --- ' * len(titles)}|", flush=True)
     found: dict[str, list[list[float]]] = {way: [] for way in WAYS}
     for seed in range(args.seeds):
+        plain = None
         for way, (script, precision) in WAYS.items():
             words = [*common, f"seed={seed}", f"trainer.precision={precision}"]
-            summary = train(f"accuracy_{seed}_{len(found[way])}", *words, script=script)["known"]["summary"]
-            found[way].append([summary[score][name] * 1e3 for score, name in COLUMNS.values()])
-            row(seed, way, found[way][-1], found["plain, float32"][-1])
-    means = {way: [statistics.mean(column) for column in zip(*rows, strict=True)] for way, rows in found.items()}
-    for way, values in means.items():
-        row("mean of seeds", way, values, means["plain, float32"])
+            summary = train("accuracy", *words, script=script)["known"]["summary"]
+            values = [summary[score][name] * 1e3 for score, name in COLUMNS.values()]
+            found[way].append(values)
+            plain = plain or values
+            row(seed, way, values, plain)
+    plain = None
+    for way, rows in found.items():
+        means = [statistics.mean(column) for column in zip(*rows, strict=True)]
+        plain = plain or means
+        row("mean of seeds", way, means, plain)
 
 
 def row(seed: object, way: str, values: list[float], plain: list[float]) -> None:

@@ -45,7 +45,8 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
     codes, gradients = model.codes(batch.rows), None
     if batch.surface_points.shape[1] and model.loss.wants_gradients(progress):
         points = batch.surface_points.clone().requires_grad_()
-        (gradients,) = torch.autograd.grad(field(model.decoder, points, codes).sum(), points, create_graph=True)
+        on_surface = field(model.decoder, points, codes)
+        (gradients,) = torch.autograd.grad(on_surface.sum(), points, create_graph=True)
     predicted = field(model.decoder, batch.points, codes)
     parts = model.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, progress)
     return sum(parts.values()), parts

@@ -4,15 +4,21 @@ import runpy
 import sys
 from pathlib import Path
 
+import plain_training
 import pytest
+import torch
 from runs import train
 
 from sdfhub.errors import SdfhubError
+from sdfhub.tasks.run import build_autodecoder
+from tests.test_config import composed
+from tests.test_training import batches
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 MISTAKES = {
     "evaluation.py --space nowhere": ["not a run's folder", "nowhere"],
     "evaluation.py --judged 1": ["argument --judged: '1': must be a whole number of at least 2"],
+    "accuracy.py --seeds 0": ["argument --seeds"],
     "training.py data.shapes=x": ["data.shapes=x", "--shapes and --samples"],
     "training.py encoding=hash": ["encoding=hash", "names say"],
     "training.py loss=nonsense": ["nonsense", "paper"],
@@ -43,3 +49,28 @@ def test_a_mistake_is_one_line(command, monkeypatch, capsys, tmp_path):
 def test_a_training_that_fails_tells_its_own_last_line():
     with pytest.raises(SdfhubError, match=r"^there is no group or key 'nonsense'"):
         train("refused", "scale=demo", "nonsense=1")
+
+
+@pytest.mark.parametrize(
+    "experiment", ["deepsdf", "fft_hosc", "fft_siren_no_normals", "hash_siren", "fft_wire"]
+)
+def test_a_step_is_that_of_the_plain_training(experiment, several):
+    """What accuracy.py compares is the same objective: only how it is computed differs."""
+    config = composed(f"experiment={experiment}", "decoder.dropout=0", "computing.points_at_once=70")
+    torch.manual_seed(0)
+    model, batch = build_autodecoder(config, rows=5, steps=10), batches(per_step=5)[0]
+    have, want = (
+        (loss, *parts.values(), *torch.autograd.grad(loss, list(model.parameters())))
+        for loss, parts in (
+            model.objective(batch, progress=0.5),
+            plain_training.objective(model, batch, progress=0.5),
+        )
+    )
+    for one, other in zip(have, want, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_a_plain_training_says_what_it_is_not_written_for():
+    model = build_autodecoder(composed("conditioning=film"), rows=5, steps=10)
+    with pytest.raises(SdfhubError, match="conditioning=concat"):
+        plain_training.objective(model, batches(per_step=5)[0], progress=0.5)
