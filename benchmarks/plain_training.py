@@ -53,7 +53,11 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
 
 
 if __name__ == "__main__":
+    import sys
+
     from sdfhub.tasks.train import main
 
+    if {"-m", "--multirun"} & set(sys.argv):  # launchers may train in other processes, by sdfhub's own steps
+        sys.exit("plain_training.py: error: makes one training; leave -m out")
     AutoDecoder.objective = objective
     main()

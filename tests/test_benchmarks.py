@@ -67,7 +67,7 @@ def test_a_step_is_that_of_the_plain_training(experiment, several):
         )
     )
     for one, other in zip(have, want, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+        assert (one - other).norm() <= 1e-4 * other.norm() + 1e-9  # of DeepSDF's, one is a rounding error
 
 
 def test_a_plain_training_says_what_it_is_not_written_for():

@@ -1,9 +1,11 @@
 """Every fast path equals its plain twin."""
 
 import math
+import time
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,6 +23,7 @@ from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
 from sdfhub.model.loops import ALONE
 from sdfhub.model.pieces import loss_in_pieces, pieces
 from sdfhub.shapes import Batch
+from sdfhub.tasks import train
 from tests.test_model import ACTIVATIONS as CHOICES
 from tests.test_model import small_decoder
 from tests.test_training import FakeShape
@@ -364,6 +367,37 @@ def test_computing_takes_what_suits_the_device():
     finally:
         Computing.put_back()
     assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_the_rate_of_bfloat16_is_measured_on_one_thread(monkeypatch):
+    multiply, threads, before = torch.mm, set(), torch.get_num_threads()
+
+    def slow_in_bfloat16(left, right):
+        threads.add(torch.get_num_threads())
+        time.sleep(0.02 if left.dtype == torch.bfloat16 else 0.005)
+        return multiply(left, right)
+
+    monkeypatch.setattr(torch, "mm", slow_in_bfloat16)
+    assert 0.1 < computing.bfloat16_rate(8) < 0.6
+    assert threads == {1} and torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "rate", "told"),
+    [
+        ("bf16-mixed", "cpu", 0.5, "2.0 times slower than float32"),
+        ("bf16-mixed", "cpu", 2.0, ""),
+        ("bf16-mixed", "cuda", 0.5, ""),
+        ("32-true", "cpu", 0.5, ""),
+    ],
+)
+def test_who_asks_for_slow_bfloat16_is_told(precision, device, rate, told, monkeypatch, capsys):
+    monkeypatch.setattr(train, "bfloat16_rate", lambda width: rate)
+    strategy = SimpleNamespace(root_device=torch.device(device))
+    trainer = SimpleNamespace(precision=precision, strategy=strategy, is_global_zero=True)
+    train.warn_of_slow_bfloat16(trainer, 128)
+    out, err = capsys.readouterr()
+    assert not out and told in err and err.count("\n") == bool(told)
 
 
 def test_on_a_gpu_without_compilers_nothing_is_compiled(monkeypatch):

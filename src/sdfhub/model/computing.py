@@ -3,6 +3,7 @@
 import ctypes
 import os
 import shutil
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,6 +114,32 @@ class Computing:
         if self.compile:
             return tuple(fast)
         return tuple(plain_if_broken(*pair) for pair in zip(fast, functions, strict=True))
+
+
+def bfloat16_rate(width: int) -> float:
+    """How fast one thread of this CPU multiplies bfloat16, over how fast it multiplies float32.
+
+    AMX and recent EPYCs come to several times; some Intel processors with AVX512-bf16 alone to about a half,
+    and those with neither to much less. Measured in at most some tenths of a second.
+
+    Args:
+        width: of the decoder, in whose layers' products there are as many features in as out.
+    """
+    seconds = {}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as a step multiplies; several would wait for other programs
+    try:
+        for dtype in (torch.bfloat16, torch.float32):
+            left, right = torch.ones(2**8, width, dtype=dtype), torch.ones(width, width, dtype=dtype)
+            taken = []
+            for _ in range(4):  # the first one also finds its kernel
+                start = time.perf_counter()
+                torch.mm(left, right)
+                taken.append(time.perf_counter() - start)
+            seconds[dtype] = min(taken)
+    finally:
+        torch.set_num_threads(threads)
+    return seconds[torch.float32] / seconds[torch.bfloat16]
 
 
 def can_compile(device: torch.device) -> bool:
