@@ -39,7 +39,7 @@ data: install ## fetch and unpack the real meshes of data=open into data/open (n
 
 BENCHMARKS := training growth procedural preparation large_mesh meshing evaluation fitting accuracy
 
-bench: install ## time all of it on this machine (half an hour on two cores, 9 GB of disk meanwhile)
+bench: install ## time all of it on this machine (a good half hour on two cores, 9 GB of disk meanwhile)
 	for each in $(BENCHMARKS); do printf "\n%s.py\n" $$each; $(BIN)/python benchmarks/$$each.py || exit 1; done
 
 clean: ## remove the environment; prepared data and runs stay
