@@ -7,6 +7,9 @@ double backward, and the whole batch is one piece on PyTorch's own threads. Data
 judging stay sdfhub's. `accuracy.py` runs it beside `train.py`; a test holds the two objectives equal.
 """
 
+import sdfhub  # noqa: F401  (before torch: it says how threads wait)
+
+# isort: split
 from itertools import zip_longest
 
 import torch

@@ -13,6 +13,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from sdfhub.errors import SdfhubError
+from sdfhub.locks import locked
 from sdfhub.tasks.wording import one_line
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def train(name: str, *overrides: str, script: str = "train.py") -> dict:
     """The content of `metrics.json` of one run under outputs/benchmarks/<name>; its output goes to stderr.
+
+    Waits while another benchmark trains there.
 
     Args:
         name: of the run's folder.
@@ -30,7 +33,6 @@ def train(name: str, *overrides: str, script: str = "train.py") -> dict:
         SdfhubError: the run failed; the message is its own last line.
     """
     folder = ROOT / "outputs" / "benchmarks" / name
-    shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
     command = [
         sys.executable,
         script,
@@ -38,11 +40,14 @@ def train(name: str, *overrides: str, script: str = "train.py") -> dict:
         f"hydra.run.dir={folder}",
         "trainer.enable_progress_bar=false",
     ]
-    done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise SdfhubError(last.removeprefix("sdfhub: error: "))
-    return json.loads((folder / "metrics.json").read_text())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with locked(folder.parent / f"{name}.lock"):
+        shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
+        done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+            raise SdfhubError(last.removeprefix("sdfhub: error: "))
+        return json.loads((folder / "metrics.json").read_text())
 
 
 def run_benchmark(main: Callable[[], None]) -> None:

@@ -28,7 +28,6 @@ import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
 import argparse
-import re
 import statistics
 import tempfile
 import time
@@ -125,9 +124,10 @@ def main() -> None:
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: PyTorch finds no GPU here")
     for override in args.overrides:
-        if re.split("[.=]", override.lstrip("+~"))[0] in UNREAD:
+        key = override.lstrip("+~").partition("=")[0]
+        if key.partition(".")[0] in UNREAD:
             parser.error(f"{override}: no step here reads it; --shapes and --samples say what a batch has")
-        if override.lstrip("+~").partition("=")[0] in NAMED:
+        if key in NAMED or key.partition(".")[0] in ("activation", "encoding"):
             parser.error(f"{override}: the rows to compare differ in it, and their names say how")
     if args.threads:
         torch.set_num_threads(args.threads)

@@ -21,6 +21,7 @@ MISTAKES = {
     "accuracy.py --seeds 0": ["argument --seeds"],
     "training.py data.shapes=x": ["data.shapes=x", "--shapes and --samples"],
     "training.py encoding=hash": ["encoding=hash", "names say"],
+    "training.py activation.beta=4": ["activation.beta=4", "names say"],
     "training.py loss=nonsense": ["nonsense", "paper"],
     "viewing.py nowhere": ["nowhere: there is no such run or file"],
     "viewing.py . many": ["'many': must be a whole number of at least 1"],

@@ -141,8 +141,8 @@ def warn_of_slow_bfloat16(trainer: Trainer, width: int) -> None:
     rate = bfloat16_rate(width)
     if rate < SLOW and trainer.is_global_zero:
         print(
-            f"trainer.precision=bf16-mixed: this CPU multiplies bfloat16 {1 / rate:.1f} times slower than "
-            "float32; 32-true is faster here, and more exact",
+            f"trainer.precision=bf16-mixed: this CPU multiplies bfloat16, {width} wide, {1 / rate:.1f} times "
+            "slower than float32; 32-true is faster here, and more exact",
             file=sys.stderr,
         )
 

@@ -38,7 +38,11 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     if missing:
         return f"{missing.group(1)}=...: must be given"
     choice = re.search(r"Could not find '[^']+/([^'/]+)' Available options in '[^']+': (.+)", text)
-    if choice and (near := get_close_matches(choice.group(1), choice.group(2).split(), n=1)):
+    if (
+        choice
+        and "did you mean" not in text
+        and (near := get_close_matches(choice.group(1), choice.group(2).split(), n=1))
+    ):
         return f"{text}; did you mean {near[0]!r}?"
     return no_such_key(unknown.group(1), config_name) if unknown else text
 
