@@ -14,12 +14,13 @@ import statistics
 
 from runs import at_least, run_benchmark, train
 
+PLAIN = "plain, float32"
 WAYS = {
-    "plain, float32": ("benchmarks/plain_training.py", "32-true"),
+    PLAIN: ("benchmarks/plain_training.py", "32-true"),
     "float32": ("train.py", "32-true"),
     "bf16-mixed": ("train.py", "bf16-mixed"),
 }
-"""Script and precision of each; the first is what the others are compared with."""
+"""Script and precision of each."""
 COLUMNS = {
     "CD, mean": ("cd", "mean"),
     "CD, median": ("cd", "median"),
@@ -40,19 +41,14 @@ def main() -> None:
     print(f"| {' | '.join(titles)} |\n{'| --- ' * len(titles)}|", flush=True)
     found: dict[str, list[list[float]]] = {way: [] for way in WAYS}
     for seed in range(args.seeds):
-        plain = None
         for way, (script, precision) in WAYS.items():
             words = [*common, f"seed={seed}", f"trainer.precision={precision}"]
             summary = train("accuracy", *words, script=script)["known"]["summary"]
-            values = [summary[score][name] * 1e3 for score, name in COLUMNS.values()]
-            found[way].append(values)
-            plain = plain or values
-            row(seed, way, values, plain)
-    plain = None
-    for way, rows in found.items():
-        means = [statistics.mean(column) for column in zip(*rows, strict=True)]
-        plain = plain or means
-        row("mean of seeds", way, means, plain)
+            found[way].append([summary[score][name] * 1e3 for score, name in COLUMNS.values()])
+            row(seed, way, found[way][-1], found[PLAIN][-1])
+    means = {way: [statistics.mean(column) for column in zip(*found[way], strict=True)] for way in WAYS}
+    for way in WAYS:
+        row("mean of seeds", way, means[way], means[PLAIN])
 
 
 def row(seed: object, way: str, values: list[float], plain: list[float]) -> None:

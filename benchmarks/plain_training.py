@@ -7,9 +7,12 @@ double backward, and the whole batch is one piece on PyTorch's own threads. Data
 judging stay sdfhub's. `accuracy.py` runs it beside `train.py`; a test holds the two objectives equal.
 """
 
+from runs import run_benchmark
+
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
+import sys
 from itertools import zip_longest
 
 import torch
@@ -21,6 +24,7 @@ from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder, Layer
 from sdfhub.model.pieces import Parts
 from sdfhub.shapes import Batch
+from sdfhub.tasks.train import main as train
 
 
 def field(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
@@ -55,12 +59,12 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
     return sum(parts.values()), parts
 
 
-if __name__ == "__main__":
-    import sys
-
-    from sdfhub.tasks.train import main
-
+def main() -> None:
     if {"-m", "--multirun"} & set(sys.argv):  # launchers may train in other processes, by sdfhub's own steps
-        sys.exit("plain_training.py: error: makes one training; leave -m out")
+        raise SdfhubError("-m: this makes one training; leave it out")
     AutoDecoder.objective = objective
-    main()
+    train()
+
+
+if __name__ == "__main__":
+    run_benchmark(main)

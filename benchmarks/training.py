@@ -53,6 +53,8 @@ UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "search
 """Groups of a training that a step without data, judging or a loop around it does not read."""
 NAMED = ("decoder", "activation", "encoding", "normals", "experiment")
 """Groups whose choices the names of the rows say."""
+UNSHARED = ("activation", "encoding")
+"""Those of them whose keys not all rows have."""
 PAPER_SAMPLES = 2000 * 16_384
 """Samples of a shape in the paper's training."""
 
@@ -127,7 +129,7 @@ def main() -> None:
         key = override.lstrip("+~").partition("=")[0]
         if key.partition(".")[0] in UNREAD:
             parser.error(f"{override}: no step here reads it; --shapes and --samples say what a batch has")
-        if key in NAMED or key.partition(".")[0] in ("activation", "encoding"):
+        if key in NAMED or key.partition(".")[0] in UNSHARED:
             parser.error(f"{override}: the rows to compare differ in it, and their names say how")
     if args.threads:
         torch.set_num_threads(args.threads)
@@ -220,10 +222,10 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str,
         print(f"| {name} | {rows / seconds[name]:,.0f} | {apart:.0%} | {cells} |")
     if PUBLISHED in seconds and seconds[PUBLISHED] > BUSY * seconds[REFERENCE]:
         print("\nDeepSDF's own process is that slow where others are at work: go by 'in our process'")
-    paper = steps["paper_585k, HOSC, normals=on, bf16"]
     for bf16 in ("", ", bf16"):
         on, off = (seconds[f"paper_585k, HOSC, normals={choice}{bf16}"] for choice in ("on", "off"))
         print(f"\nnormals=on takes {on / off:.2f} times the step of normals=off{bf16}")
+    paper = steps["paper_585k, HOSC, normals=on, bf16"]
     print(
         f"\na sample of it, bf16: {paper.operations() / rows / 1e6:.2f} M operations, "
         f"{paper.bytes() / rows / 1e3:.1f} kB moved at least"

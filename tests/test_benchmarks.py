@@ -11,6 +11,7 @@ from runs import train
 
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.run import build_autodecoder
+from sdfhub.tasks.wording import one_line
 from tests.test_config import composed
 from tests.test_training import batches
 
@@ -19,6 +20,7 @@ MISTAKES = {
     "evaluation.py --space nowhere": ["not a run's folder", "nowhere"],
     "evaluation.py --judged 1": ["argument --judged: '1': must be a whole number of at least 2"],
     "accuracy.py --seeds 0": ["argument --seeds"],
+    "plain_training.py -m seed=0,1": ["-m: this makes one training"],
     "training.py data.shapes=x": ["data.shapes=x", "--shapes and --samples"],
     "training.py encoding=hash": ["encoding=hash", "names say"],
     "training.py activation.beta=4": ["activation.beta=4", "names say"],
@@ -50,6 +52,9 @@ def test_a_mistake_is_one_line(command, monkeypatch, capsys, tmp_path):
 def test_a_training_that_fails_tells_its_own_last_line():
     with pytest.raises(SdfhubError, match=r"^there is no group or key 'nonsense'"):
         train("refused", "scale=demo", "nonsense=1")
+    with pytest.raises(SdfhubError) as refused:
+        train("refused", "category=chair")
+    assert one_line(refused.value).count("did you mean 'chairs'?") == 1
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Every fast path equals its plain twin."""
 
 import math
-import time
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from functools import partial
@@ -370,15 +369,16 @@ def test_computing_takes_what_suits_the_device():
 
 
 def test_the_rate_of_bfloat16_is_measured_on_one_thread(monkeypatch):
-    multiply, threads, before = torch.mm, set(), torch.get_num_threads()
+    threads, before, clock = set(), torch.get_num_threads(), [0.0]
+    seconds = {torch.bfloat16: [9.0, 8.0, 4.0], torch.float32: [9.0, 1.0, 2.0]}  # disturbed, by turns
 
-    def slow_in_bfloat16(left, right):
+    def multiply(left, right):
         threads.add(torch.get_num_threads())
-        time.sleep(0.02 if left.dtype == torch.bfloat16 else 0.005)
-        return multiply(left, right)
+        clock[0] += seconds[left.dtype].pop(0)
 
-    monkeypatch.setattr(torch, "mm", slow_in_bfloat16)
-    assert 0.1 < computing.bfloat16_rate(8) < 0.6
+    monkeypatch.setattr(torch, "mm", multiply)
+    monkeypatch.setattr(computing.time, "perf_counter", lambda: clock[0])
+    assert computing.bfloat16_rate(8) == 1 / 4
     assert threads == {1} and torch.get_num_threads() == before
 
 

@@ -120,7 +120,7 @@ def bfloat16_rate(width: int) -> float:
     """How fast one thread of this CPU multiplies bfloat16, over how fast it multiplies float32.
 
     AMX and recent EPYCs come to several times; some Intel processors with AVX512-bf16 alone to about a half,
-    and those with neither to much less. Measured in at most some tenths of a second.
+    and those with neither to much less. Measured in less than a second, mostly in much less.
 
     Args:
         width: of the decoder, in whose layers' products there are as many features in as out.
@@ -130,9 +130,9 @@ def bfloat16_rate(width: int) -> float:
     torch.set_num_threads(1)  # as a step multiplies; several would wait for other programs
     try:
         for dtype in (torch.bfloat16, torch.float32):
-            left, right = torch.ones(2**8, width, dtype=dtype), torch.ones(width, width, dtype=dtype)
+            left, right = torch.ones(LEAST, width, dtype=dtype), torch.ones(width, width, dtype=dtype)
             taken = []
-            for _ in range(4):  # the first one also finds its kernel
+            for _ in range(3):  # the first one also finds its kernel
                 start = time.perf_counter()
                 torch.mm(left, right)
                 taken.append(time.perf_counter() - start)

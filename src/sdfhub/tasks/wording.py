@@ -23,6 +23,8 @@ def one_line(error: Exception, config_name: str = "config") -> str:
         return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
     text = re.sub(r"\s+", " ", str(error)).strip() or type(error).__name__
     text = text.split(" Config search path:")[0].split(" full_key:")[0].split(" See https://hydra.cc")[0]
+    if isinstance(error, SdfhubError):  # worded already, perhaps in another process
+        return text
     if "hydra/sweeper/optuna'" in text:
         return "search: needs Optuna; pip install 'sdfhub[optuna]'"
     if "hydra/launcher/ray'" in text:
@@ -38,11 +40,7 @@ def one_line(error: Exception, config_name: str = "config") -> str:
     if missing:
         return f"{missing.group(1)}=...: must be given"
     choice = re.search(r"Could not find '[^']+/([^'/]+)' Available options in '[^']+': (.+)", text)
-    if (
-        choice
-        and "did you mean" not in text
-        and (near := get_close_matches(choice.group(1), choice.group(2).split(), n=1))
-    ):
+    if choice and (near := get_close_matches(choice.group(1), choice.group(2).split(), n=1)):
         return f"{text}; did you mean {near[0]!r}?"
     return no_such_key(unknown.group(1), config_name) if unknown else text
 
