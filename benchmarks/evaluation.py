@@ -24,11 +24,11 @@ import numpy as np
 import trimesh
 from runs import ROOT, at_least, run_benchmark
 
-from sdfhub.data.normalize import normalize_mesh
-from sdfhub.data.preparation import DEFAULT
-from sdfhub.data.procedural import generate
+from sdfhub.data.preparation.normalize import normalize_mesh
+from sdfhub.data.preparation.settings import DEFAULT
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.metrics import Judge, Mesh, chamfer, sample_surface
+from sdfhub.procedural import generate
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks.run import read_run
 

@@ -20,9 +20,9 @@ import yaml
 from runs import ROOT, at_least, run_benchmark, train
 
 import sdfhub
-from sdfhub.data.batches import signed_samples
-from sdfhub.data.shards import StoredShape
+from sdfhub.data.loading.batches import signed_samples
 from sdfhub.data.splits import Split, split
+from sdfhub.data.store.shards import StoredShape
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1

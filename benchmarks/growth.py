@@ -33,13 +33,13 @@ import torch
 from runs import at_least, run_benchmark
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sdfhub.data import shards, store
-from sdfhub.data.batches import Augmentation, Loading, StepBatches
-from sdfhub.data.sampling import Preparation
+from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.preparation.sampling import Preparation
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import split
-from sdfhub.data.store import Store
-from sdfhub.model.computing import keep_freed_memory
+from sdfhub.data.store import shards, store
+from sdfhub.data.store.store import Store
+from sdfhub.model.fast.computing import keep_freed_memory
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "outputs" / "benchmarks" / "growth"

@@ -17,8 +17,8 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from runs import at_least, run_benchmark  # noqa: E402
 
-from sdfhub.data.preparation import Preparation  # noqa: E402
-from sdfhub.data.sampling import prepare_mesh  # noqa: E402
+from sdfhub.data.preparation.sampling import prepare_mesh  # noqa: E402
+from sdfhub.data.preparation.settings import Preparation  # noqa: E402
 
 SIDE = 1000
 """Rings and meridians of the sphere: twice its square are its faces."""

@@ -25,7 +25,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from lightning.pytorch import Trainer
 
-from sdfhub.data import store as stores
+from sdfhub.data.store import store as stores
 from sdfhub.settings import flat
 from sdfhub.tasks import train as train_task
 from sdfhub.tasks.app import register_resolvers

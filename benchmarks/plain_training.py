@@ -22,7 +22,7 @@ from torch import Tensor
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.decoder import Decoder, Layer
-from sdfhub.model.pieces import Parts
+from sdfhub.model.fast.pieces import Parts
 from sdfhub.shapes import Batch
 from sdfhub.tasks.train import main as train
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from runs import at_least, run_benchmark
 
-from sdfhub.data.procedural import CATEGORIES, generate
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.render import render
+from sdfhub.procedural import CATEGORIES, generate
 from sdfhub.shapes import RADIUS
 
 

@@ -29,16 +29,16 @@ from runs import at_least, run_benchmark
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sdfhub.data.scan import Scan
-from sdfhub.data.shards import StoredShape
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store import shape_seed
-from sdfhub.data.target import Target, observed
+from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.store import shape_seed
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import judge, point_to_surface, sample_surface
 from sdfhub.geometry.render import render
+from sdfhub.scans.scan import Scan
+from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
 from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from hydra import compose
 
-from sdfhub.data.batches import Augmentation, Loading, StepBatches
-from sdfhub.data.resident import ResidentBatches
-from sdfhub.model.computing import distances
-from sdfhub.side_by_side import side_by_side
+from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.model.fast.computing import distances
+from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.tasks.build import plain
 from sdfhub.tasks.run import build_autodecoder
 

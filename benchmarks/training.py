@@ -40,7 +40,7 @@ from hydra import initialize_config_dir
 from reference import ReferenceProcess, ReferenceStep
 from steps import Copy, OurField, OurStep, Product, RandomShape
 
-from sdfhub.model.computing import TOGETHER, keep_freed_memory
+from sdfhub.model.fast.computing import TOGETHER, keep_freed_memory
 from sdfhub.tasks.app import register_resolvers
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

@@ -13,7 +13,7 @@ import statistics
 from runs import at_least, run_benchmark
 
 import sdfhub
-from sdfhub.tasks.live_meshing import LiveMesher, Meshed
+from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 
 RESOLUTIONS = (64, 128, 192, 256)
 

@@ -13,9 +13,9 @@ import lightning as L
 import pytest
 import torch
 
+from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
+from sdfhub.checkpoint_file import read_checkpoint
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
-from sdfhub.tasks.checkpoint_file import read_checkpoint
 from sdfhub.tasks.run import build_autodecoder, read_weights
 from tests.test_config import composed
 from tests.test_training import batches
@@ -51,7 +51,7 @@ class Data(L.LightningDataModule):
         self.workers = workers
 
     def train_dataloader(self):
-        from sdfhub.data.datamodule import EpochSteps
+        from sdfhub.data.loading.datamodule import EpochSteps
 
         sampler = EpochSteps(STEPS, done=lambda: self.trainer.global_step)
         return torch.utils.data.DataLoader(

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from sdfhub.latent.fitting import field_and_jacobian
 from sdfhub.model.decoder import Layer
 from sdfhub.model.film import Film
-from sdfhub.model.fitting import field_and_jacobian
 from sdfhub.settings import flat
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed, parameters

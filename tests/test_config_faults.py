@@ -10,7 +10,7 @@ import pytest
 from lightning.pytorch import Trainer
 
 from benchmarks.overrides import Started, answer, keys_and_groups, random_override, shelf, started
-from sdfhub.data import store as stores
+from sdfhub.data.store import store as stores
 from sdfhub.errors import SdfhubError
 from sdfhub.settings import flat
 from sdfhub.tasks import train as train_task

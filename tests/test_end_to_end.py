@@ -17,10 +17,10 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sdfhub
-from sdfhub.data.procedural import generate
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
+from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate_run
 from sdfhub.tasks.run import build_autodecoder, read_weights

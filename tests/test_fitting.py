@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.model.fitting import AdamFit, GaussNewtonFit, field_and_jacobian, initial_codes
+from sdfhub.latent.fitting import AdamFit, GaussNewtonFit, field_and_jacobian, initial_codes
 from sdfhub.model.losses import clamped_l1
 from tests.test_model import small_decoder
 from tests.test_training import FakeShape, batches

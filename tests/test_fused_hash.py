@@ -8,15 +8,15 @@ import lightning as L
 import pytest
 import torch
 
-from sdfhub.data.batches import Augmentation, Loading
-from sdfhub.data.datamodule import SdfDataModule
+from sdfhub.data.loading.batches import Augmentation, Loading
+from sdfhub.data.loading.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
-from sdfhub.model import fused_hash
 from sdfhub.model.activations import Siren
-from sdfhub.model.computing import Computing
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.encodings import Encoding, Fourier, Hash
-from sdfhub.model.fused_hash import FusedHash, fused
+from sdfhub.model.fast import fused_hash
+from sdfhub.model.fast.computing import Computing
+from sdfhub.model.fast.fused_hash import FusedHash, fused
 from sdfhub.tasks.run import build_autodecoder
 from tests import twin_tinycudann
 from tests.test_config import composed

@@ -22,13 +22,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sdfhub.data import fetch
-from sdfhub.data.mesh import triangles_of
-from sdfhub.data.shards import RECORD, read_record
 from sdfhub.data.sources.deepsdf import read_samples
 from sdfhub.data.sources.furniture import furniture_in, read_model
+from sdfhub.data.sources.mesh_files import triangles_of
 from sdfhub.data.sources.source import Shape
 from sdfhub.data.sources.split_file import with_roles
-from sdfhub.data.store import Store
+from sdfhub.data.store.shards import RECORD, read_record
+from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
 from sdfhub.report.results import read_sweep
 from sdfhub.tasks.run import read_run, read_weights

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sdfhub.data.store import Store
+from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
 from sdfhub.report.results import read_sweep
 from sdfhub.tasks import sweep as sweeps

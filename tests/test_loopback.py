@@ -13,7 +13,7 @@ from websockets.http11 import Request
 from websockets.sync.client import connect
 
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.loopback import MAX_UPLOAD, PART, Gate, LoopbackServer, refusal
+from sdfhub.viewer.loopback import MAX_UPLOAD, PART, Gate, LoopbackServer, refusal
 from tests.test_view import wait_until
 
 

@@ -12,9 +12,9 @@ import pytest
 import trimesh
 from manifold3d import Manifold, OpType
 
-from sdfhub.data.mesh import read_mesh
-from sdfhub.data.preparation import Preparation
-from sdfhub.data.sampling import prepare_mesh
+from sdfhub.data.preparation.sampling import prepare_mesh
+from sdfhub.data.preparation.settings import Preparation
+from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.errors import RejectedMesh
 from tests.broken_twins import chair_parts, errors, refined, triangles
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from sdfhub.data.ac3d import read_ac3d
-from sdfhub.data.mesh import FORMATS, read_mesh
+from sdfhub.data.sources.ac3d import read_ac3d
 from sdfhub.data.sources.folder import FolderSource
+from sdfhub.data.sources.mesh_files import FORMATS, read_mesh
 from sdfhub.errors import RejectedMesh, SdfhubError
-from sdfhub.tasks.mesh_file import write_mesh
+from sdfhub.geometry.mesh_file import write_mesh
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -176,7 +176,7 @@ def test_missing_and_unknown_files_are_named(tmp_path, monkeypatch):
     with pytest.raises(SdfhubError, match=r"a\.blend: not a mesh format"):
         read_mesh(tmp_path / "a.blend")
     (tmp_path / "a.obj").write_text(TRIANGLE)
-    monkeypatch.setattr("sdfhub.data.mesh.MAX_BYTES", 5)
+    monkeypatch.setattr("sdfhub.data.sources.mesh_files.MAX_BYTES", 5)
     with pytest.raises(SdfhubError, match=r"a\.obj: larger"):
         read_mesh(tmp_path / "a.obj")
 
@@ -277,6 +277,6 @@ def test_trouble_of_the_machine_is_no_fault_of_a_mesh(tmp_path, monkeypatch):
     def exhausted(*_):
         raise MemoryError
 
-    monkeypatch.setattr("sdfhub.data.mesh._by_trimesh", exhausted)
+    monkeypatch.setattr("sdfhub.data.sources.mesh_files._by_trimesh", exhausted)
     with pytest.raises(MemoryError):
         read_mesh(tmp_path / "a.obj")

@@ -8,8 +8,8 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sdfhub.data.procedural import CATEGORIES, design, generate
 from sdfhub.errors import SdfhubError
+from sdfhub.procedural import CATEGORIES, design, generate
 
 SAMPLE = [*range(0, 96, 8), 69]  # 69: a Chesterfield on tapered legs
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 import trimesh
 
-from sdfhub.data.scan import Scan
-from sdfhub.data.target import observed
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.scan import Scan
+from sdfhub.scans.target import observed
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.tasks import calibration as calibrations
 from sdfhub.tasks import reconstruct as task

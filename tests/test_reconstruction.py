@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.model.fitting import AdamFit
-from sdfhub.model.observed import Problem, Rows, rows_of, violation
-from sdfhub.model.prior import GaussianPrior, IsotropicPrior, Normal
-from sdfhub.model.reconstruction import DeepSdfFit, MapFit
-from sdfhub.model.similarity import SIZE, PoseRange, small_similarity, turns
+from sdfhub.latent.fitting import AdamFit
+from sdfhub.latent.observed import Problem, Rows, rows_of, violation
+from sdfhub.latent.prior import GaussianPrior, IsotropicPrior, Normal
+from sdfhub.latent.reconstruction import DeepSdfFit, MapFit
+from sdfhub.latent.similarity import SIZE, PoseRange, small_similarity, turns
 from sdfhub.shapes import Observation
 from tests.test_fitting import ADAM, decoder  # noqa: F401 - a fixture
 

@@ -3,11 +3,11 @@ import pytest
 import trimesh
 from manifold3d import CrossSection, Manifold, OpType
 
-from sdfhub.data.preparation import Preparation
-from sdfhub.data.procedural import CATEGORIES, generate
-from sdfhub.data.sampling import prepare_mesh
-from sdfhub.data.signs import SIGN_METHODS, Signs
+from sdfhub.data.preparation.sampling import prepare_mesh
+from sdfhub.data.preparation.settings import Preparation
+from sdfhub.data.preparation.signs import SIGN_METHODS, Signs
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.procedural import CATEGORIES, generate
 from sdfhub.shapes import RADIUS
 from tests.broken_twins import BREAKAGES, chair_parts, errors, refined, ring, signed_distance, triangles
 

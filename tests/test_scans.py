@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from sdfhub.data.cloud import is_outside, noise_of, winding
-from sdfhub.data.evidence import Evidence
-from sdfhub.data.free_space import free_space
-from sdfhub.data.normalize import normalize_mesh
-from sdfhub.data.scan import Scan, read_scan
-from sdfhub.data.scanning import surface_scan, view_scan
-from sdfhub.data.target import observed
+from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.cloud import is_outside, noise_of, winding
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.free_space import free_space
+from sdfhub.scans.scan import Scan, read_scan
+from sdfhub.scans.scanning import surface_scan, view_scan
+from sdfhub.scans.target import observed
 from sdfhub.shapes import RADIUS
 
 EVIDENCE = {"rows": 3000, "surface": 0.25, "uniform": 0.15, "variances": (0.005, 0.0005), "cells": 40}

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from sdfhub.latent.fitting import GaussNewtonFit
 from sdfhub.model.activations import Hosc, Relu, Siren
-from sdfhub.model.computing import Computing, distances
-from sdfhub.model.dropout import drawn_from, kept
-from sdfhub.model.fitting import GaussNewtonFit
-from sdfhub.model.loops import ALONE
-from sdfhub.side_by_side import _pool, side_by_side
+from sdfhub.model.fast.computing import Computing, distances
+from sdfhub.model.fast.dropout import drawn_from, kept
+from sdfhub.model.fast.loops import ALONE
+from sdfhub.model.fast.side_by_side import _pool, side_by_side
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed
 from tests.test_fitting import NEWTON, draws
@@ -25,7 +25,7 @@ from tests.test_training import batches
 
 FORKED = """
 import os, torch
-from sdfhub.side_by_side import side_by_side
+from sdfhub.model.fast.side_by_side import side_by_side
 torch.set_num_threads(2)
 work = lambda number: number + 1
 assert side_by_side(work, range(4)) == [1, 2, 3, 4]

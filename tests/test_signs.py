@@ -4,12 +4,12 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from manifold3d import Manifold, OpType
 
-from sdfhub.data.normalize import normalize_mesh
-from sdfhub.data.pieces import ROOM, cut_long
-from sdfhub.data.preparation import Preparation
-from sdfhub.data.sampling import sample_points
-from sdfhub.data.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
-from sdfhub.data.visibility import (
+from sdfhub.data.preparation.normalize import normalize_mesh
+from sdfhub.data.preparation.pieces import ROOM, cut_long
+from sdfhub.data.preparation.sampling import sample_points
+from sdfhub.data.preparation.settings import Preparation
+from sdfhub.data.preparation.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
+from sdfhub.data.preparation.visibility import (
     closed_surface,
     points_on_faces,
     sightings,

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from sdfhub.data import procedural
-from sdfhub.data.preparation import Preparation
+from sdfhub import procedural
+from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources import DeepSdfSource, FolderSource, OpenSource, ProceduralSource, ShapeNetSource
 from sdfhub.data.sources.deepsdf import read_samples
 from sdfhub.data.sources.source import Shape
-from sdfhub.data.store import prepare
+from sdfhub.data.store.store import prepare
 from sdfhub.errors import RejectedMesh, SdfhubError
 from tests.categories import CATEGORIES
 

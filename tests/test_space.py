@@ -13,10 +13,10 @@ import yaml
 from safetensors.torch import save_file
 
 import sdfhub
-import sdfhub.model.distribution
+import sdfhub.latent.distribution
 import sdfhub.space
 from sdfhub.errors import SdfhubError
-from sdfhub.model.distribution import CodeDistribution
+from sdfhub.latent.distribution import CodeDistribution
 from sdfhub.shapes import Frame
 from sdfhub.tasks.opening import FORMAT, write_space
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
@@ -236,7 +236,7 @@ def test_a_grid_that_does_not_fit_is_one_clear_line(space, monkeypatch):
         space.mesh(0, resolution=5000)
 
 
-@pytest.mark.parametrize("module", [sdfhub.space, sdfhub.model.distribution])
+@pytest.mark.parametrize("module", [sdfhub.space, sdfhub.latent.distribution])
 def test_the_examples_in_the_documentation_run(run, module):
     failed, tried = doctest.testmod(module, extraglobs={"run": run, "sdfhub": sdfhub})
     assert tried > 1 and not failed

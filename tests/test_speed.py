@@ -11,16 +11,16 @@ import torch
 import torch.nn.functional as F
 from torch._dynamo.backends.common import aot_autograd
 
-from sdfhub.data.batches import Augmentation, Loading, StepBatches
-from sdfhub.data.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.loading.resident import ResidentBatches
 from sdfhub.errors import SdfhubError
-from sdfhub.model import computing
 from sdfhub.model.activations import Activation, Hosc, Relu, Siren, joined
-from sdfhub.model.computing import Computing
-from sdfhub.model.dropout import kept
 from sdfhub.model.encodings import Fourier, Gaussian, Hash, Identity
-from sdfhub.model.loops import ALONE
-from sdfhub.model.pieces import loss_in_pieces, pieces
+from sdfhub.model.fast import computing
+from sdfhub.model.fast.computing import Computing
+from sdfhub.model.fast.dropout import kept
+from sdfhub.model.fast.loops import ALONE
+from sdfhub.model.fast.pieces import loss_in_pieces, pieces
 from sdfhub.shapes import Batch
 from sdfhub.tasks import train
 from tests.test_model import ACTIVATIONS as CHOICES

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sdfhub.tasks.checkpoint_file import read_checkpoint
+from sdfhub.checkpoint_file import read_checkpoint
 from tests.test_end_to_end import ROOT, TINY, run
 
 pytestmark = pytest.mark.slow

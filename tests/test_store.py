@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from sdfhub.data import shards, store
-from sdfhub.data.manifest import read_manifest, write_manifest
-from sdfhub.data.sampling import Preparation
+from sdfhub.data.preparation.sampling import Preparation
 from sdfhub.data.sources.source import Shape, Source
-from sdfhub.data.store import Store, prepare
+from sdfhub.data.store import shards, store
+from sdfhub.data.store.manifest import read_manifest, write_manifest
+from sdfhub.data.store.store import Store, prepare
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
 

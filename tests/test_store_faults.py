@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfhub.data import shards, store
-from sdfhub.data.comparison import COMPARED
-from sdfhub.data.manifest import MANIFEST, read_manifest
-from sdfhub.data.store import Store
+from sdfhub.data.store import shards, store
+from sdfhub.data.store.comparison import COMPARED
+from sdfhub.data.store.manifest import MANIFEST, read_manifest
+from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
 from tests.test_store import Balls, ball, fill
 

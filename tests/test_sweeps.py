@@ -12,6 +12,7 @@ from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 
+from sdfhub.callbacks.showing import TrainingRecord
 from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import PlannedCell
 from sdfhub.report.results import Cell, read_sweep
@@ -20,7 +21,6 @@ from sdfhub.settings import flat, settings_digest
 from sdfhub.tasks import train as train_task
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
-from sdfhub.tasks.callbacks import TrainingRecord
 from sdfhub.tasks.cells import finished
 from sdfhub.tasks.evaluate import build_evaluation
 from sdfhub.tasks.run import build_autodecoder

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.data.batches import Augmentation, Loading, StepBatches, draw_rows
-from sdfhub.data.datamodule import EpochSteps
+from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches, draw_rows
+from sdfhub.data.loading.datamodule import EpochSteps
 from sdfhub.errors import SdfhubError
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
 from sdfhub.model.optim import Adam, Cosine, StepDecay

@@ -10,13 +10,13 @@ import torch
 import trimesh
 
 import sdfhub
-from sdfhub.data.scan import read_scan
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.scan import read_scan
 from sdfhub.space import reconstruct
 from sdfhub.tasks import view as view_task
-from sdfhub.tasks.dropped_scan import fit_scan
-from sdfhub.tasks.live_meshing import LiveMesher, Meshed
-from sdfhub.tasks.viewer import MEAN, Viewer, told
+from sdfhub.viewer.dropped_scan import fit_scan
+from sdfhub.viewer.live_meshing import LiveMesher, Meshed
+from sdfhub.viewer.page import MEAN, Viewer, told
 from tests.ball_space import IDS, RADII, write_ball_run
 
 
@@ -260,7 +260,7 @@ def test_a_files_name_is_text_on_the_page(viewer):
 
 def test_without_viser_one_line_says_what_to_install(monkeypatch, run):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for name in ("sdfhub.tasks.viewer", "sdfhub.tasks.loopback"):
+    for name in ("sdfhub.viewer.page", "sdfhub.viewer.loopback"):
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(SdfhubError, match=r"pip install 'sdfhub\[view\]'"):
         view_task.view({"run": str(run), "port": 0, "resolution": 32})

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import sdfhub
-from sdfhub.tasks.viewer import Viewer
+from sdfhub.viewer.page import Viewer
 from tests.ball_space import IDS, write_ball_run
 from tests.browser import empty_page
 from tests.test_view import ball_file, wait_until

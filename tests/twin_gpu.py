@@ -15,14 +15,14 @@ from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from sdfhub.data.batches import Augmentation, Loading
-from sdfhub.data.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading
+from sdfhub.data.loading.resident import ResidentBatches
 from sdfhub.geometry.grid import Grid
+from sdfhub.latent.fitting import AdamFit, field_and_jacobian
+from sdfhub.latent.observed import Problem, Rows
+from sdfhub.latent.prior import GaussianPrior
+from sdfhub.latent.similarity import PoseRange
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.model.fitting import AdamFit, field_and_jacobian
-from sdfhub.model.observed import Problem, Rows
-from sdfhub.model.prior import GaussianPrior
-from sdfhub.model.similarity import PoseRange
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed
 

@@ -6,7 +6,7 @@ from typing import Any
 # PyTorch's threads would keep a core busy for milliseconds after their work, while others wait for it
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-from sdfhub.data.sampling import Preparation, prepare_mesh
+from sdfhub.data.preparation.sampling import Preparation, prepare_mesh
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 

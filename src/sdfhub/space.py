@@ -28,15 +28,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sdfhub.data.evidence import Evidence
-from sdfhub.data.scan import Scan
-from sdfhub.data.target import observed
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
-from sdfhub.model.computing import distances
+from sdfhub.latent.distribution import CodeDistribution
+from sdfhub.latent.reconstruction import MapFit
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.distribution import CodeDistribution
-from sdfhub.model.reconstruction import MapFit
+from sdfhub.model.fast.computing import distances
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.scan import Scan
+from sdfhub.scans.target import observed
 from sdfhub.shapes import NORMALIZED, Frame, check_id
 
 Array = np.ndarray | Tensor

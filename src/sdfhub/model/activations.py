@@ -12,10 +12,10 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from sdfhub.model.dropout import kept
-from sdfhub.model.loops import fits
-from sdfhub.model.rectifier import Rectifier
-from sdfhub.model.waves import Wave
+from sdfhub.model.fast.dropout import kept
+from sdfhub.model.fast.loops import fits
+from sdfhub.model.fast.rectifier import Rectifier
+from sdfhub.model.fast.waves import Wave
 
 
 def joined(hidden: Tensor, beside: Tensor | None) -> Tensor:

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.codes import CodeTable
-from sdfhub.model.computing import Computing
 from sdfhub.model.decoder import Decoder
+from sdfhub.model.fast.computing import Computing
+from sdfhub.model.fast.pieces import Parts, loss_in_pieces
 from sdfhub.model.losses import SdfLoss
 from sdfhub.model.optim import Adam
-from sdfhub.model.pieces import Parts, loss_in_pieces
 from sdfhub.shapes import Batch
 
 

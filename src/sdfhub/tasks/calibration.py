@@ -13,14 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sdfhub.data.evidence import BOUNDS, Evidence
-from sdfhub.data.scan import LEAST, Scan
-from sdfhub.data.scanning import surface_scan, view_scan
-from sdfhub.data.shards import StoredShape
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store import shape_seed
-from sdfhub.data.target import Target, observed
+from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.store import shape_seed
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.evidence import BOUNDS, Evidence
+from sdfhub.scans.scan import LEAST, Scan
+from sdfhub.scans.scanning import surface_scan, view_scan
+from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.build import build
 from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole

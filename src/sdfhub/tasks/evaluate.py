@@ -14,18 +14,18 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.batches import draw_rows, signed_samples
-from sdfhub.data.shards import StoredShape
+from sdfhub.data.loading.batches import draw_rows, signed_samples
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store import shape_seed
+from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.store import shape_seed
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import Judge
-from sdfhub.model.computing import distances
+from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.fitting import Fit
+from sdfhub.model.fast.computing import distances
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.space import reconstruct
 from sdfhub.tasks.app import run_task

@@ -14,10 +14,10 @@ from torch.export import Dim
 from tqdm import tqdm
 
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesh_file import FORMATS, write_mesh
 from sdfhub.model.decoder import Decoder
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.mesh_file import FORMATS, write_mesh
 from sdfhub.tasks.opening import beside, load, write_space
 from sdfhub.whole_file import write_whole
 

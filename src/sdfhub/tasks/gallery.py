@@ -8,9 +8,9 @@ from tqdm import tqdm
 
 from sdfhub.geometry.animation import animation
 from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.mesh_file import write_mesh, write_row
 from sdfhub.geometry.render import render
 from sdfhub.space import Space, reconstruct
-from sdfhub.tasks.mesh_file import write_mesh, write_row
 
 COLUMNS = 8
 """Pictures side by side where there is no order in them."""

@@ -19,13 +19,13 @@ from omegaconf import DictConfig
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from sdfhub.checkpoint_file import LAST, write_checkpoint
 from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shape_id
 from sdfhub.data.sources.split_file import names_listed
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
 from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.checkpoint_file import LAST, write_checkpoint
 from sdfhub.tasks.opening import load, trained_decoder
 from sdfhub.tasks.run import begin_run
 

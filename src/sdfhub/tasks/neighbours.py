@@ -5,8 +5,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from sdfhub.data.scan import read_scan
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.scan import read_scan
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery

@@ -16,10 +16,10 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from sdfhub.data.evidence import Evidence
 from sdfhub.errors import SdfhubError
+from sdfhub.latent.reconstruction import Method
 from sdfhub.model.decoder import Decoder
-from sdfhub.model.reconstruction import Method
+from sdfhub.scans.evidence import Evidence
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
 from sdfhub.tasks.build import build, check
@@ -115,8 +115,8 @@ def default_fitting(delta: float) -> tuple[Evidence, Method]:
         for file in ("reconstruct.yaml", "method/map.yaml", "prior/gaussian.yaml")
     )
     return (
-        build(evidence["evidence"], "evidence", within="sdfhub.data"),
-        build(method | {"prior": prior, "delta": delta}, "method", within="sdfhub.model"),
+        build(evidence["evidence"], "evidence", within="sdfhub.scans"),
+        build(method | {"prior": prior, "delta": delta}, "method", within="sdfhub.latent"),
     )
 
 

@@ -8,12 +8,12 @@ from typing import Any
 from omegaconf import DictConfig
 from pydantic import NonNegativeInt, PositiveInt
 
-from sdfhub.data import store as stores
-from sdfhub.data.sampling import Preparation
-from sdfhub.data.shards import StoredShape
+from sdfhub.data.preparation.sampling import Preparation
 from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store import Store
+from sdfhub.data.store import store as stores
+from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain

@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 from pydantic import Field
 from tqdm import tqdm
 
-from sdfhub.data.scan import FORMATS
 from sdfhub.data.sources.source import unique_ids
-from sdfhub.data.target import FrameKind, Target
 from sdfhub.errors import SdfhubError
+from sdfhub.scans.scan import FORMATS
+from sdfhub.scans.target import FrameKind, Target
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.calibration import Alike, Limits, calibrated
@@ -75,13 +75,13 @@ def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
     """The space of a run or an exported file, and how it is to be used."""
     frame = check(config["frame"], FrameKind, "frame")
     space = load(run)
-    prior = build(config["prior"], "prior", within="sdfhub.model")
-    poses = build(config["poses"], "poses", within="sdfhub.model", up=space.up)
+    prior = build(config["prior"], "prior", within="sdfhub.latent")
+    poses = build(config["poses"], "poses", within="sdfhub.latent", up=space.up)
     return Reconstructor(
         space,
         likely=prior(space.codes),
-        method=build(config["method"], "method", within="sdfhub.model", delta=clamp(space.config)),
-        evidence=build(config["evidence"], "evidence", within="sdfhub.data"),
+        method=build(config["method"], "method", within="sdfhub.latent", delta=clamp(space.config)),
+        evidence=build(config["evidence"], "evidence", within="sdfhub.scans"),
         frame=frame,
         poses=poses if frame == "unknown" else None,
         resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),

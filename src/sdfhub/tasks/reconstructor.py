@@ -10,17 +10,17 @@ import numpy as np
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.evidence import Evidence
-from sdfhub.data.scan import read_scan
-from sdfhub.data.target import FrameKind, Target, observed
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
-from sdfhub.model.prior import Normal
-from sdfhub.model.reconstruction import Fitted, Method
-from sdfhub.model.similarity import PoseRange
+from sdfhub.latent.prior import Normal
+from sdfhub.latent.reconstruction import Fitted, Method
+from sdfhub.latent.similarity import PoseRange
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.scan import read_scan
+from sdfhub.scans.target import FrameKind, Target, observed
 from sdfhub.space import Space
 from sdfhub.tasks.calibration import Alike, Limits
-from sdfhub.tasks.mesh_file import write_mesh
 from sdfhub.whole_file import write_whole
 
 

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 import yaml
 
+from sdfhub.checkpoint_file import LAST, read_checkpoint
 from sdfhub.errors import SdfhubError
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Frame
 from sdfhub.tasks.build import build
-from sdfhub.tasks.checkpoint_file import LAST, read_checkpoint
 from sdfhub.whole_file import write_whole
 
 if TYPE_CHECKING:

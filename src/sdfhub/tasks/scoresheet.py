@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from sdfhub.data.shards import StoredShape
+from sdfhub.data.store.shards import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import ShapeMetrics, summarize
 from sdfhub.geometry.render import render
-from sdfhub.tasks.mesh_file import write_mesh
 from sdfhub.whole_file import write_whole
 
 COLUMNS = {

@@ -18,19 +18,19 @@ from omegaconf import DictConfig
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
-from sdfhub.data.batches import Loading
-from sdfhub.data.datamodule import SdfDataModule
+from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
+from sdfhub.callbacks.showing import LossBar, LossLines, TrainingRecord
+from sdfhub.data.loading.batches import Loading
+from sdfhub.data.loading.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.model.computing import bfloat16_rate
+from sdfhub.model.fast.computing import bfloat16_rate
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
 from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import Seed, build, check, plain
-from sdfhub.tasks.callbacks import LossBar, LossLines, TrainingRecord
 from sdfhub.tasks.cells import go_on, run_cell
-from sdfhub.tasks.checkpoint import WholeFileIO, checkpointing
 from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
 from sdfhub.tasks.prepare import Prepared, prepare_data

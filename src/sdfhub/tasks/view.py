@@ -19,7 +19,7 @@ def view(config: dict[str, Any]) -> None:
     port = check(config["port"], Annotated[int, Field(ge=0, le=65535)], "port")
     resolution = check(config["resolution"], Annotated[int, Field(ge=8, le=512)], "resolution")
     try:
-        from sdfhub.tasks.viewer import Viewer
+        from sdfhub.viewer.page import Viewer
     except ImportError as error:
         raise SdfhubError("view: needs more packages: pip install 'sdfhub[view]'") from error
     viewer = Viewer(load(run), Path(run).resolve().name, port, resolution)

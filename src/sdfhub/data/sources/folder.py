@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from sdfhub.data.mesh import FORMATS, buffer_path, read_mesh
+from sdfhub.data.sources.mesh_files import FORMATS, buffer_path, read_mesh
 from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, name_of_root, unique_ids
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError

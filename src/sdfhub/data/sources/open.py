@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sdfhub.data.mesh import MAX_BYTES, triangles_of
 from sdfhub.data.sources.furniture import furniture_in, read_model
+from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
 from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, plain_categories
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.whole_file import write_whole

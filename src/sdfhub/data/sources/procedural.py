@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from sdfhub.data import procedural
+from sdfhub import procedural
 from sdfhub.data.sources.source import Shape, Source, Triangles, plain_categories
 from sdfhub.errors import SdfhubError
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from sdfhub.data.mesh import read_mesh
+from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.sources.source import (
     Shape,
     Source,

@@ -1,0 +1,175 @@
+"""Streams per-shape samples as training batches: step number in, batch out, nothing remembered.
+
+A batch is a function of (seed, step), so that a resumed run sees what an uninterrupted one would, with any
+number of loader workers. Shards are pre-shuffled, so a random draw is one contiguous, wrapping slice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from sdfhub.data.store.store import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Batch
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Extra training shapes: seeded similar copies of the real ones, each with a code of its own.
+
+    The paper names data augmentation and does not describe it. Reflection and uniform scaling are the
+    transforms under which a signed distance stays exact (d becomes scale * d), so these it is; the code
+    table grows by a factor 1 + copies.
+
+    Args:
+        copies: transformed copies of each shape, >= 0; 0 switches augmentation off.
+        mirror: whether odd copies are reflected in the plane x = 0.
+        smallest: lower end of the uniform distribution, up to 1, of a copy's scale, in (0, 1].
+    """
+
+    copies: int = 0
+    mirror: bool = True
+    smallest: float = 0.8
+
+    def __post_init__(self):
+        if self.copies < 0 or not 0 < self.smallest <= 1:
+            raise ValueError("copies must not be negative and smallest in (0, 1]")
+
+    def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
+        """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
+        if copy == 0:
+            return np.ones(3, np.float32), np.float32(1)
+        scale = np.float32(np.random.default_rng((seed, row)).uniform(self.smallest, 1))
+        flip = -1 if self.mirror and copy % 2 else 1
+        return np.float32([flip, 1, 1]) * scale, scale
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How much of which shapes a training step sees.
+
+    Args:
+        shapes_per_step: B, >= 1.
+        samples_per_shape: N, half outside, half inside, >= 2.
+        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
+        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
+            from being shorter than their overhead.
+        workers: loader processes; 0 draws in the training process.
+        resident: whether all samples lie in the memory of the device that trains; None: where that is a GPU.
+        augmentation: extra shapes.
+        seed: of every draw.
+    """
+
+    shapes_per_step: int
+    samples_per_shape: int
+    surface_per_shape: int
+    passes_per_epoch: int
+    workers: int
+    augmentation: Augmentation
+    seed: int
+    resident: bool | None = None
+
+    def __post_init__(self):
+        least = {"shapes_per_step": 1, "samples_per_shape": 2, "surface_per_shape": 0}
+        least |= {"passes_per_epoch": 1, "workers": 0, "seed": 0}
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+
+
+class StepBatches(Dataset):
+    """Training batches by step number.
+
+    Args:
+        shapes: S prepared shapes; shape s has code row s, its copy c row s + c * S.
+        loading: what a step draws; never more shapes a step than there are rows.
+    """
+
+    def __init__(self, shapes: Sequence[StoredShape], loading: Loading):
+        self.shapes, self.loading = shapes, loading
+        self.rows = len(shapes) * (1 + loading.augmentation.copies)
+        self.shapes_per_step = min(loading.shapes_per_step, self.rows)
+        self.steps_per_pass = self.rows // self.shapes_per_step
+        self.rank, self.world = 0, 1
+
+    def share(self, rank: int, world: int) -> None:
+        """Keeps, of every batch, the part of process `rank` of `world`."""
+        if self.shapes_per_step % world:
+            raise SdfhubError(
+                f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared by {world} processes; "
+                f"choose a multiple of {world}, at most {self.rows}"
+            )
+        self.rank, self.world = rank, world
+
+    def __len__(self) -> int:
+        return self.steps_per_pass
+
+    def __getitem__(self, step: int) -> Batch:
+        rows = self.rows_of(step)
+        samples = np.empty((len(rows), self.loading.samples_per_shape, 4), np.float32)
+        surface = np.empty((len(rows), self.loading.surface_per_shape, 6), np.float32)
+        for row, *of_shape in zip(rows, samples, surface, strict=True):
+            self._draw(int(row), self.generator(step, row), *of_shape)
+        return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
+
+    def rows_of(self, step: int) -> np.ndarray:
+        """[B] int64 rows of the code table that a step sees, of them this process's share."""
+        # every pass shuffles anew; rows beyond the last whole step wait for another pass's order
+        rng = np.random.default_rng((self.loading.seed, 1, step // self.steps_per_pass))
+        start = step % self.steps_per_pass * self.shapes_per_step
+        rows = rng.permutation(self.rows)[start : start + self.shapes_per_step]
+        return rows[self.rank :: self.world]
+
+    def generator(self, step: int, row: int) -> np.random.Generator:
+        """What draws the samples of one row at one step."""
+        return np.random.default_rng((self.loading.seed, 2, step, row))
+
+    def _draw(self, row: int, rng: np.random.Generator, samples: np.ndarray, surface: np.ndarray) -> None:
+        """Fills samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
+        copy, index = divmod(row, len(self.shapes))
+        shape = self.shapes[index]
+        axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
+        draw_signed(samples, shape, rng)
+        draw_rows(surface, shape, "surface", rng)
+        if copy:
+            samples *= np.append(axes, scale)
+            surface *= np.concatenate([axes, np.sign(axes)])
+
+
+def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
+    """A batch from its rows [B], samples [B, N, 4] and oriented surface points [B, M, 6]."""
+    return Batch(rows, samples[..., :3], samples[..., 3], surface[..., :3], surface[..., 3:])
+
+
+def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
+    rows = np.empty((count, 4), np.float32)
+    draw_signed(rows, shape, rng)
+    return rows
+
+
+def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> None:
+    """Fills rows [N, 4], contiguous, with what `signed_samples` returns."""
+    outside = len(rows) - len(rows) // 2
+    draw_rows(rows[:outside], shape, "outside", rng)
+    draw_rows(rows[outside:], shape, "inside", rng)
+
+
+def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
+    """Refuses to draw rows of an array that has none.
+
+    Raises:
+        SdfhubError: names the shape and the array.
+    """
+    if count and not shape.rows(name):
+        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
+
+
+def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
+    """Fills rows [n, C], contiguous, with consecutive ones of a pre-shuffled array from a random start."""
+    refuse_empty(shape, name, len(rows))
+    if len(rows):
+        shape.read_into(rows, name, int(rng.integers(shape.rows(name))))

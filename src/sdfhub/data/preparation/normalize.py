@@ -1,0 +1,117 @@
+"""Raw triangle arrays, validated, moved to the normalised frame and cleaned there."""
+
+import numpy as np
+
+from sdfhub.data.preparation.settings import DEFAULT, Preparation
+from sdfhub.errors import RejectedMesh
+from sdfhub.shapes import RADIUS, NormalizedMesh
+from sdfhub.triangles import face_normals, piece_count
+
+ZERO_AREA = 1e-15
+"""Area, in normalised units squared, that rounding alone may leave of a line; such a triangle has none."""
+
+
+def normalize_mesh(
+    vertices: np.ndarray, faces: np.ndarray, preparation: Preparation = DEFAULT
+) -> NormalizedMesh:
+    """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
+
+    The frame comes before the merging: a tolerance means something only once the size is known, and a mesh
+    of scale 1e20 or 1e-12 must survive it. Triangles with the same three corners count once, whichever way
+    they turn.
+
+    Args:
+        vertices: [V, 3] numbers, source units.
+        faces: [F, 3] integers, rows of `vertices`.
+        preparation: `min_faces`, `min_extent_ratio`, `max_zero_area` and `max_components` are used.
+    Raises:
+        RejectedMesh: the arrays make no mesh, or a limit is passed.
+    """
+    vertices, faces = _checked_arrays(vertices, faces)
+    if len(faces) < preparation.min_faces:
+        raise RejectedMesh("too_few_faces", f"{len(faces)} faces, at least {preparation.min_faces} wanted")
+    vertices, center, scale = _normalized(vertices, faces, preparation.min_extent_ratio)
+    vertices, faces = _merged(vertices, faces)
+    faces = _with_area(vertices, faces, preparation.max_zero_area)
+    faces = _without_repeats(faces, len(vertices))
+    count = piece_count(faces, len(vertices))
+    if count > preparation.max_components:
+        limit = preparation.max_components
+        raise RejectedMesh("too_many_components", f"{count} pieces, at most {limit} wanted")
+    return NormalizedMesh(vertices, faces, center, scale)
+
+
+def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        vertices, faces = np.asarray(vertices), np.asarray(faces)
+    except ValueError as error:  # rows of different lengths
+        raise RejectedMesh("malformed_arrays", str(error)) from error
+    if faces.size == 0 or vertices.size == 0:
+        raise RejectedMesh("no_faces", f"{len(vertices)} vertices and {len(faces)} faces")
+    for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            raise RejectedMesh(
+                "malformed_arrays", f"{name}: expected [N, 3] numbers, got {list(array.shape)} {array.dtype}"
+            )
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RejectedMesh(
+            "face_index_out_of_range", f"{faces.min()} to {faces.max()}, with {len(vertices)} vertices"
+        )
+    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+    if bad:
+        raise RejectedMesh("non_finite_vertices", f"{bad} of {len(vertices)} vertices are not finite")
+    return vertices, faces
+
+
+def _normalized(
+    vertices: np.ndarray, faces: np.ndarray, min_extent_ratio: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    used = _used(faces, len(vertices))
+    corners = vertices[used]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    half = high / 2 - low / 2  # halves first: the sum of two large numbers may overflow
+    if not half.max() > 0 or half.min() / half.max() < min_extent_ratio:
+        ratio = half.min() / half.max() if half.max() > 0 else 0.0
+        detail = f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted"
+        raise RejectedMesh("flat", detail)
+    center = high / 2 + low / 2
+    unit = (vertices - center) / half.max()  # near 1 before squares are taken
+    farthest = np.linalg.norm(unit[used], axis=1).max()
+    scale = RADIUS / farthest / half.max()
+    if not (np.isfinite(scale) and scale > 0):
+        raise RejectedMesh("extent_out_of_range", f"largest extent {2 * half.max():.2g} cannot be normalised")
+    return unit * (RADIUS / farthest), center, float(scale)
+
+
+def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that share a cell of width 1e-6 become the first of them; unused ones go."""
+    used = _used(faces, len(vertices))
+    cells = np.floor((vertices[used] + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
+    keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
+    _, first, row = np.unique(keys, return_index=True, return_inverse=True)
+    merged = np.empty(len(vertices), np.int64)
+    merged[used] = row
+    return vertices[used][first], merged[faces]
+
+
+def _used(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """Rows of the vertices that have a face, ascending."""
+    is_used = np.zeros(vertex_count, bool)
+    is_used[faces.ravel()] = True
+    return np.flatnonzero(is_used)
+
+
+def _without_repeats(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """The first of the faces with the same three corners, in the order of these."""
+    low, middle, high = np.sort(faces, axis=1).T
+    pair = np.unique(low * vertex_count + middle, return_inverse=True)[1]  # numbers, faster than rows
+    return faces[np.unique(pair * vertex_count + high, return_index=True)[1]]
+
+
+def _with_area(vertices: np.ndarray, faces: np.ndarray, max_zero_area: float) -> np.ndarray:
+    filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
+    empty = 1 - filled.mean()
+    if empty > max_zero_area:
+        raise RejectedMesh("zero_area_faces", f"{empty:.1%} of the faces, at most {max_zero_area:.0%} wanted")
+    return faces[filled]

@@ -1,0 +1,228 @@
+"""Which faces of a mesh can be seen from outside, and from which of their sides.
+
+What no view sees is interior and goes; what is seen mostly from its back is turned round; what is seen
+from both sides is a sheet without an inside.
+"""
+
+import os
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from sdfhub.data.preparation.settings import Preparation
+from sdfhub.errors import RejectedMesh
+from sdfhub.shapes import NormalizedMesh
+from sdfhub.triangles import face_normals, piece_count
+
+os.environ.setdefault(
+    "IGL_NUM_THREADS", "1"
+)  # read by libigl's first call: shapes run in parallel, not points
+
+FIRST, SECOND = 16, 48
+"""Rays at every face, and at those that the first ones leave open."""
+RAYS = 1_500_000
+"""Rays of a round above which a face gets fewer than that, down to half."""
+LARGE, AGAIN = 200_000, 3
+"""Rays of the first round on top, shared out by area; a face gets this many times as many in the second."""
+SURE = 0.12
+"""Share of its rays that must reach a face, all on one side, to need no others (an open side has 0.5)."""
+CHUNK = 50_000
+BAD = 0.1
+"""Share of sightings on its less seen side from which a face counts as bad."""
+STEP = 1e-3
+"""Distance from a face at which the winding number before and behind it is taken."""
+SOLID = 0.8
+"""Winding number above which the space behind a face counts as solid."""
+TOUCH = 5e-6
+"""Above a face by which a ray towards the eye starts, so that a coincident face does not stop it."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The faces that bound a shape, oriented outwards.
+
+    Args:
+        vertices: [V, 3] float64, normalised frame.
+        faces: [F, 3] int64, counter-clockwise seen from outside.
+        two_sided: [F] bool, sheets seen from both sides: a distance, but no inside.
+        statistics: plain numbers about how the faces were found.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    two_sided: np.ndarray
+    statistics: dict[str, float]
+
+    def solid(self) -> np.ndarray:
+        """[S, 3] the faces that separate inside from outside."""
+        return self.faces[~self.two_sided]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """How much of each face is seen, as a share of what an isolated face would be from all around.
+
+    Args:
+        front: [F] of the counter-clockwise side, in [0, 1]; an unoccluded side reaches about 0.5.
+        back: [F] of the other side.
+    """
+
+    front: np.ndarray
+    back: np.ndarray
+
+
+def view_directions(count: int) -> np.ndarray:
+    """[count, 3] unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
+
+
+def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """[N, 3] a uniform point on each triangle named in `face`, [N] rows of `corners` [F, 3, 3]."""
+    root = np.sqrt(rng.random(len(face), corners.dtype))
+    third = root * rng.random(len(face), corners.dtype)
+    corner = corners[face]
+    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
+    points += third[:, None] * (corner[:, 2] - corner[:, 0])
+    points += corner[:, 0]
+    return points
+
+
+def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
+    """The share of each face's two sides that parallel views from all around see.
+
+    Rays are aimed at points on the faces rather than spread over pictures: a small face is then judged by as
+    many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
+    large ones more often; a second looks again at those that the first leaves open.
+    """
+    watch = _Watch(mesh, rng.permutation(view_directions(views)), rng)
+    large = (watch.area / watch.area.sum() * LARGE).astype(np.int64)
+    watch.look(np.arange(len(large)), large + _fair(len(large), FIRST))
+    again = np.flatnonzero(_is_open(*watch.sums))
+    if len(again):
+        watch.look(again, AGAIN * large[again] + _fair(len(again), SECOND))
+    return Sightings(*(watch.sums[:2] / np.maximum(watch.sums[2], 1e-12)))
+
+
+def _fair(faces: int, most: int) -> int:
+    return int(np.clip(RAYS // faces, most // 2, most))
+
+
+def _is_open(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarray:
+    """[F] whether too few sightings, or some of either side, leave undecided what a face is."""
+    return (front + back < SURE * cast) | (np.minimum(front, back) > 0)
+
+
+class _Watch:
+    """Rays from all around at the faces of one mesh, and the sums of what they have seen.
+
+    Args:
+        mesh: what is looked at.
+        directions: [D, 3] towards the eye; a face takes them one after the other.
+        rng: of the points on the faces and of each face's first direction.
+    """
+
+    def __init__(self, mesh: NormalizedMesh, directions: np.ndarray, rng: np.random.Generator):
+        self.directions, self.rng = directions.astype(np.float32), rng
+        self.corners = mesh.vertices.astype(np.float32)[mesh.faces]
+        normals = face_normals(mesh.vertices, mesh.faces)
+        self.area = np.linalg.norm(normals, axis=1)
+        self.normals = (normals / self.area[:, None]).astype(np.float32)
+        self.next = rng.integers(len(directions), size=len(mesh.faces))
+        self.sums = np.zeros((3, len(mesh.faces)))  # weighted by the cosine: front, back, cast
+        self.scene = EmbreeScene()
+        TriangleMesh(self.scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+
+    def look(self, faces: np.ndarray, rays: np.ndarray) -> None:
+        """Casts `rays` [S] rays, at least one, at each of `faces` [S]."""
+        ends = np.cumsum(rays)
+        bounds = np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK))
+        for some in np.split(np.arange(len(faces)), np.unique(bounds)):
+            if len(some):
+                self._look(faces[some], rays[some])
+        self.next[faces] += rays
+
+    def _look(self, faces: np.ndarray, rays: np.ndarray) -> None:
+        starts = np.cumsum(rays) - rays
+        turn = np.repeat(self.next[faces] - starts, rays) + np.arange(rays.sum())
+        direction = self.directions[turn % len(self.directions)]
+        origins = points_on_faces(self.corners, np.repeat(faces, rays), self.rng)
+        origins += np.float32(TOUCH) * direction
+        cosine = np.einsum("nj,nj->n", np.repeat(self.normals[faces], rays, axis=0), direction)
+        seen = np.where(self.scene.run(origins, direction, query="OCCLUDED") < 0, cosine, 0)
+        for row, weight in enumerate((np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine))):
+            self.sums[row, faces] += np.add.reduceat(weight, starts)
+
+
+def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.random.Generator) -> Surface:
+    """The faces that are seen, each turned to the side that is seen most, sheets marked.
+
+    Source: DeepSDF (Park et al. 2019), section 5: oriented points from what 100 virtual cameras see.
+
+    DeepSDF's two gates hold for the vote alone, in which each sighting speaks for itself: a mesh that lacks
+    2% of its faces fails them, while the winding number closes such holes and judges its own certainty.
+
+    Raises:
+        RejectedMesh: too much of it are sheets, or too many sightings contradict each other.
+    """
+    seen = sightings(mesh, preparation.views, rng)
+    total = seen.front + seen.back
+    wrong = np.minimum(seen.front, seen.back)
+    kept = total > preparation.hidden_below
+    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
+    faces = np.where((seen.back > seen.front)[:, None], mesh.faces[:, ::-1], mesh.faces)
+    two_sided = kept & (wrong > preparation.two_sided_above * total)
+    two_sided[two_sided] = ~_bounds_a_solid(mesh.vertices, faces[kept], faces[two_sided])
+    if not (kept & ~two_sided).any():
+        raise RejectedMesh(
+            "two_sided_area", "no visible face has a single visible side, so nothing has an inside"
+        )
+    visible = np.where(kept, area, 0)
+    statistics = {
+        "hidden_area": float(area[~kept].sum() / area.sum()),
+        "turned_area": float(area[kept & (seen.back > seen.front)].sum() / area.sum()),
+        "two_sided_area": float(visible[two_sided].sum() / visible.sum()),
+        "contradictory": float((visible * wrong).sum() / (visible * total).sum()),
+        "bad_faces": float((visible * (wrong > BAD * total)).sum() / visible.sum()),
+    }
+    for name in ("two_sided_area", *(("contradictory", "bad_faces") if preparation.sign == "vote" else ())):
+        limit = getattr(preparation, f"max_{name}")
+        if statistics[name] > limit:
+            raise RejectedMesh(name, f"{statistics[name]:.1%}, at most {limit:.0%} wanted")
+    return Surface(mesh.vertices, np.ascontiguousarray(faces[kept]), two_sided[kept], statistics)
+
+
+def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarray) -> np.ndarray:
+    """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it.
+
+    A wall seen from within through a hole looks two-sided, but behind it the number is nearly 1. Behind a
+    sheet it is about 1/2, before it -1/2.
+    """
+    normals = face_normals(vertices, suspects)
+    step = STEP * normals / np.linalg.norm(normals, axis=1)[:, None]
+    centre = vertices[suspects].mean(axis=1)
+    tree = igl.FastWindingNumberBVH()
+    tree.init(vertices, np.ascontiguousarray(faces), 2)
+    return (tree.winding_number(centre - step) > SOLID) & (tree.winding_number(centre + step) < 1 - SOLID)
+
+
+def closed_surface(mesh: NormalizedMesh) -> Surface | None:
+    """All faces, if they form one closed, consistently oriented shell of positive volume; else None."""
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    forward = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
+    backward = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
+    forward.sort()
+    backward.sort()
+    if (np.diff(forward) == 0).any() or not np.array_equal(forward, backward):
+        return None  # an edge without exactly two faces, or two faces that run along it the same way
+    volume = (
+        np.einsum("nj,nj->", mesh.vertices[mesh.faces[:, 0]], face_normals(mesh.vertices, mesh.faces)) / 6
+    )
+    if volume <= 0 or piece_count(mesh.faces, len(mesh.vertices)) > 1:
+        return None
+    return Surface(mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), bool), {"fast_path": 1.0})

@@ -1,5 +1,0 @@
-"""Parametric shapes of five categories, made on demand: index i of a category is always the same shape."""
-
-from sdfhub.data.procedural.catalogue import CATEGORIES, VERSION, design, generate
-
-__all__ = ["CATEGORIES", "VERSION", "design", "generate"]

@@ -1,0 +1,200 @@
+"""Mesh files of the usual formats, read as bare triangles: no materials, no merging, no repair."""
+
+import io
+import json
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+
+from sdfhub.data.sources.ac3d import read_ac3d
+from sdfhub.errors import RejectedMesh, SdfhubError
+
+FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
+MAX_BYTES = 1 << 30
+"""A larger file is refused before it is read: text formats take some ten times their size in memory."""
+MAX_VERTICES = 50_000_000
+"""Of a glTF's scene: a small file may draw one mesh many times."""
+
+_BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
+
+
+def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] float64 and triangles [F, 3] int64 of a mesh file, in the file's frame and units.
+
+    The parts of a scene are put together under their transforms; polygons become triangles. Vertices are
+    neither merged nor dropped.
+
+    Raises:
+        SdfhubError: the file is missing, too large or of no known format.
+        RejectedMesh: empty_file, corrupt_file, no_faces or non_finite_vertices; the detail names the file.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise SdfhubError(f"{path}: not a mesh format known here ({' '.join(FORMATS)})")
+    if not path.is_file():
+        raise SdfhubError(f"{path}: no such file")
+    if path.stat().st_size > MAX_BYTES:
+        raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; decimate the mesh first")
+    return triangles_of(path.read_bytes(), path.suffix.lower(), str(path), path.parent)
+
+
+def triangles_of(
+    content: bytes, suffix: str, name: str, folder: Path | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The triangles of a mesh file's content; see `read_mesh`.
+
+    Args:
+        content: the whole file.
+        suffix: one of FORMATS.
+        name: what messages call it.
+        folder: where a .gltf finds its buffers; None forbids other files.
+    """
+    if not content.strip():
+        raise RejectedMesh("empty_file", f"{name} holds nothing")
+    if suffix == ".obj" and (bad := _BAD_NUMBER.search(content)):
+        line = bad[0].strip().decode(errors="replace")
+        raise RejectedMesh("non_finite_vertices", f"{name} has the line {line!r}")
+    try:
+        check_length(content, suffix)
+        if suffix in (".glb", ".gltf"):
+            _check_gltf(content, suffix)
+        vertices, faces = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
+    except RejectedMesh as rejection:
+        raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
+    except MemoryError:  # the machine's trouble, not the file's
+        raise
+    except Exception as error:  # trimesh raises whatever the broken bytes lead to
+        is_foreign = isinstance(error, ImportError)  # it would guess at the encoding of what is no text
+        why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
+        raise RejectedMesh("corrupt_file", f"{name} cannot be read as {suffix[1:]} ({why})") from error
+    _check_triangles(vertices, faces, name)
+    return vertices, faces
+
+
+def check_length(content: bytes, suffix: str) -> None:
+    """Refuses files that end before all that their header promises; trimesh takes what there is."""
+    promised, held = 0, len(content)
+    if suffix == ".glb":
+        promised = int.from_bytes(content[8:12], "little")
+    elif suffix == ".stl" and not content.lstrip().startswith(b"solid"):
+        promised = 84 + 50 * int.from_bytes(content[80:84], "little")
+    elif suffix == ".ply" and b"\nformat ascii" in content[:1000]:
+        head, _, body = content.partition(b"end_header")
+        promised = sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE)))
+        held = _lines(body)
+    elif suffix == ".off":
+        counts = re.match(rb"(?:\s|#[^\n]*\n)*OFF(?:\s|#[^\n]*\n)+(\d+)\s+(\d+)(?:[ \t]+\d+)?", content)
+        promised = sum(map(int, counts.groups())) if counts else 0
+        held = _lines(content[counts.end() :]) if counts else 0
+    if promised > held:
+        raise RejectedMesh("corrupt_file", f"ends too early: its header promises {promised}, it holds {held}")
+
+
+def _check_gltf(content: bytes, suffix: str) -> None:
+    """Refuses a glTF whose vertices trimesh would replace by zeros, or that claims more than memory holds."""
+    if suffix == ".glb":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    scene = json.loads(content)
+    primitives = [primitive for mesh in scene.get("meshes", []) for primitive in mesh["primitives"]]
+    packed = {name for each in [scene, *primitives] for name in _extensions(each) if "compression" in name}
+    if packed:
+        raise RejectedMesh("compressed", f"needs {', '.join(sorted(packed))}; export it without compression")
+    accessors = scene.get("accessors", [])
+    if any("bufferView" not in accessor and "sparse" not in accessor for accessor in accessors):
+        raise RejectedMesh("corrupt_file", "claims numbers that it does not hold")
+    counts = [
+        sum(accessors[part["attributes"]["POSITION"]]["count"] for part in mesh["primitives"])
+        for mesh in scene.get("meshes", [])
+    ]
+    drawn = sum(counts[node["mesh"]] for node in scene.get("nodes", []) if "mesh" in node)
+    if drawn > MAX_VERTICES:
+        raise RejectedMesh("too_large", f"draws {drawn:,} vertices, at most {MAX_VERTICES:,} are read")
+
+
+def _extensions(node: dict) -> list[str]:
+    return [*node.get("extensionsRequired", []), *node.get("extensions", {})]
+
+
+def _lines(body: bytes) -> int:
+    """Lines with something on them."""
+    return sum(1 for line in body.splitlines() if line.strip())
+
+
+def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
+
+    options = {}
+    if suffix in (".obj", ".off"):
+        content = _utf8(content)
+    if suffix in (".obj", ".glb", ".gltf"):
+        options["skip_materials"] = True
+    files = _Beside(folder if suffix == ".gltf" else None)
+    with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused below
+        mesh = trimesh.load_mesh(
+            io.BytesIO(content), file_type=suffix[1:], process=False, resolver=files, **options
+        )
+    return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+
+
+def _utf8(content: bytes) -> bytes:
+    """Text in any encoding as UTF-8: names and comments may be in another, numbers are the same in all."""
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return content.decode("latin-1").encode()
+    return content
+
+
+def _check_triangles(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
+    if not faces.size:
+        raise RejectedMesh("no_faces", f"{name} holds no faces: a point cloud, not a mesh")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RejectedMesh("corrupt_file", f"{name} has a face with a vertex that is not there")
+    if not np.isfinite(vertices).all():
+        count = int((~np.isfinite(vertices)).any(axis=1).sum())
+        raise RejectedMesh("non_finite_vertices", f"{name} has {count} vertices that are not finite")
+
+
+class _Beside:
+    """Gives a .gltf the buffers that lie below its own folder and nothing else: its paths are not trusted.
+
+    A resolver to trimesh, by its methods rather than by descent, which would import trimesh.
+    """
+
+    def __init__(self, folder: Path | None):
+        self.folder = folder
+
+    def get(self, name: str) -> bytes:
+        path = buffer_path(self.folder, name)
+        if path is None:
+            raise FileNotFoundError(f"its buffer {name!r} does not lie beside it")
+        return path.read_bytes()
+
+    def __getitem__(self, name: str) -> bytes:
+        return self.get(name)
+
+    def __contains__(self, name: str) -> bool:
+        return False
+
+    def keys(self):
+        return []
+
+    def write(self, name, data):
+        raise PermissionError("meshes are only read")
+
+    def namespaced(self, namespace):
+        return self
+
+
+def buffer_path(folder: Path | None, name: str) -> Path | None:
+    """Where a file that a .gltf names lies, or None where it is not below `folder` or too large.
+
+    Args:
+        folder: of the .gltf.
+        name: percent-encoded, as the format has it; some exporters write names as they are.
+    """
+    paths = [(folder / each).resolve() for each in (name, unquote(name))] if folder else []
+    found = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
+    return found[0] if found and found[0].stat().st_size <= MAX_BYTES else None

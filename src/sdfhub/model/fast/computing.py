@@ -1,0 +1,201 @@
+"""How a step is computed on the machine at hand: choices of speed and memory, not of what is learned."""
+
+import ctypes
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Literal
+
+import torch
+import torch._functorch.config as aot
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.model.decoder import Decoder
+from sdfhub.model.encodings import Encoding
+from sdfhub.model.fast.fused_hash import can_fuse, fused
+from sdfhub.model.fast.side_by_side import side_by_side
+
+TOGETHER = {"cpu": 2**13, "cuda": 2**18}
+"""Samples worked on together: what stays in a core's caches; what fills a GPU and not its memory."""
+
+LEAST = 2**10
+"""Samples that are worth a thread of their own."""
+
+_NO_TWIN = (
+    "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
+    "tiny-cuda-nn built for it; null takes it where it is there"
+)
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
+
+
+@dataclass(frozen=True)
+class Computing:
+    """Settings that suit a device; None takes what does.
+
+    Args:
+        points_at_once: samples that go through the decoder together, on a CPU in each thread, >= 1; bounds
+            memory.
+        compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
+            None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
+        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result but for
+            rounding: it adds up a table's gradient in any order. None: on a GPU, where it is installed and
+            agrees, and no deterministic algorithms are asked for.
+        matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
+            (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
+    """
+
+    points_at_once: int | None = None
+    compile: bool | None = None
+    tinycudann: bool | None = None
+    matmul: Literal["highest", "high", "medium"] | None = None
+
+    def __post_init__(self):
+        if self.points_at_once is not None and self.points_at_once < 1:
+            raise ValueError(f"points_at_once must be at least 1 or null, got {self.points_at_once}")
+
+    def threads(self, device: torch.device) -> int:
+        """Threads that work on samples of their own: on a CPU all, but what is compiled has one caller."""
+        return 1 if device.type != "cpu" or self.compile else torch.get_num_threads()
+
+    def together(self, device: torch.device, samples: int) -> int:
+        """Of so many samples, those that are worked on together on this device, in one thread."""
+        most = self.points_at_once or TOGETHER.get(device.type, TOGETHER["cuda"])
+        return min(most, max(LEAST, -(-samples // self.threads(device))))
+
+    def set_up(self, device: torch.device) -> None:
+        """Sets the precision of this process's products, and keeps the memory it frees."""
+        torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
+        keep_freed_memory()
+
+    @staticmethod
+    def put_back() -> None:
+        """Products are exact again, as PyTorch begins: what is trained is judged with all its digits."""
+        torch.set_float32_matmul_precision("highest")
+
+    def quickest(self, encoding: Encoding, device: torch.device) -> Encoding:
+        """The encoding, or its twin by tiny-cuda-nn.
+
+        Raises:
+            SdfhubError: the twin was asked for, and there is none here that agrees.
+        """
+        self.refuse_impossible(encoding, device)
+        exact = self.tinycudann is None and torch.are_deterministic_algorithms_enabled()
+        if self.tinycudann is False or exact or not can_fuse(encoding, device):
+            return encoding
+        twin = fused(encoding)
+        if self.tinycudann and twin is encoding:
+            raise SdfhubError(_NO_TWIN)
+        return twin
+
+    def refuse_impossible(self, encoding: Encoding, device: torch.device) -> None:
+        """Refuses to train by what is not there, before anything is prepared.
+
+        Raises:
+            SdfhubError: tiny-cuda-nn was asked for, where it cannot be.
+        """
+        if self.tinycudann and not can_fuse(encoding, device):
+            raise SdfhubError(_NO_TWIN)
+
+    def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
+        """The functions themselves, or what `torch.compile` makes of them on this device.
+
+        What an earlier training of this process compiled is forgotten: there is room for few versions.
+        """
+        if not (can_compile(device) if self.compile is None else self.compile):
+            return functions
+        torch.compiler.reset()
+        fast = [torch.compile(function) for function in functions]
+        if self.compile:
+            return tuple(fast)
+        return tuple(plain_if_broken(*pair) for pair in zip(fast, functions, strict=True))
+
+
+def bfloat16_rate(width: int) -> float:
+    """How fast one thread of this CPU multiplies bfloat16, over how fast it multiplies float32.
+
+    AMX and recent EPYCs come to several times; some Intel processors with AVX512-bf16 alone to about a half,
+    and those with neither to much less. Measured in less than a second, mostly in much less.
+
+    Args:
+        width: of the decoder, in whose layers' products there are as many features in as out.
+    """
+    seconds = {}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as a step multiplies; several would wait for other programs
+    try:
+        for dtype in (torch.bfloat16, torch.float32):
+            left, right = torch.ones(LEAST, width, dtype=dtype), torch.ones(width, width, dtype=dtype)
+            taken = []
+            for _ in range(3):  # the first one also finds its kernel
+                start = time.perf_counter()
+                torch.mm(left, right)
+                taken.append(time.perf_counter() - start)
+            seconds[dtype] = min(taken)
+    finally:
+        torch.set_num_threads(threads)
+    return seconds[torch.float32] / seconds[torch.bfloat16]
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether what `torch.compile` needs beside PyTorch for a GPU is there."""
+    tools = shutil.which(os.environ.get("CC", "cc")) and find_spec("triton")
+    return device.type == "cuda" and bool(tools)
+
+
+def plain_if_broken(fast: Callable, plain: Callable) -> Callable:
+    """Calls `fast`, and from its first failure on `plain`, whose failure is the caller's.
+
+    The backward pass is compiled with the forward one, so that its failure counts too.
+    """
+    broken = False
+
+    def call(*arguments):
+        nonlocal broken
+        if not broken:
+            try:
+                with aot.patch(force_non_lazy_backward_lowering=True):  # later, nobody could go on without
+                    return fast(*arguments)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:
+                broken = True
+                cause = getattr(error, "inner_exception", error)
+                reason = f"{type(cause).__name__}: {str(cause).strip().partition(chr(10))[0]}"
+                warnings.warn(f"computing.compile: goes on without, {reason}", stacklevel=2)
+        return plain(*arguments)
+
+    return call
+
+
+def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
+    """`decoder(points, codes)` [B, N], in parts: on a CPU side by side, else one after the other.
+
+    Args:
+        points: [B, N, 3], normalised frame.
+        codes: [B, L].
+    """
+    samples = points.shape[0] * points.shape[1]
+    count = -(-samples // Computing().together(points.device, samples))
+    parts = points.tensor_split(max(1, min(count, points.shape[1])), dim=1)
+    in_turn = side_by_side if points.is_cpu else map
+    return torch.cat([*in_turn(lambda part: decoder(part, codes), parts)], dim=1)
+
+
+def keep_freed_memory() -> None:
+    """Lets this process keep blocks it has freed, up to a GiB, where the C library is glibc.
+
+    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step. Threads
+    share what is kept, or each would have its own.
+    """
+    try:
+        set_option = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+    for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
+        set_option(option, value)

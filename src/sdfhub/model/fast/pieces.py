@@ -1,0 +1,121 @@
+"""A large batch in pieces: the gradient of the whole in the memory of a part, on all cores.
+
+DeepSDF's paper batch is a million points; the activations of all of them at once would take tens of
+gigabytes, and on a CPU even a few thousand leave its caches. A core that works on pieces of its own waits for
+no other.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from sdfhub.model.fast.dropout import drawn_from
+from sdfhub.model.fast.side_by_side import side_by_side
+from sdfhub.shapes import Batch
+
+Parts = dict[str, Tensor]
+"""Weighted terms of the loss by name; their sum is the loss."""
+
+Share = Sequence[Callable[[], Parts]]
+"""Pieces that one thread differentiates, one after the other: what each adds to the parts of the loss."""
+
+
+def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
+    """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals.
+
+    Args:
+        batch: [B, N] samples, [B, M] surface points.
+        points: whole shapes together where several fit, else parts of one shape, >= 1.
+    """
+    shapes, samples = batch.sdf.shape
+    surface = max(1, batch.surface_points.shape[1])
+    together, cuts = max(1, points // samples), -(-samples // points)
+    for first in range(0, shapes, together):
+        some = slice(first, first + together)
+        each = [getattr(batch, name)[some].tensor_split(cuts, dim=1) for name in batch.__match_args__[1:]]
+        for columns in zip(*each, strict=True):
+            piece = Batch(batch.rows[some], *columns)
+            part = len(piece.rows) / shapes
+            yield (
+                piece,
+                part * piece.sdf.shape[1] / samples,
+                part * piece.surface_points.shape[1] / surface,
+            )
+
+
+def loss_in_pieces(
+    parts_of: Callable[[Batch], Parts],
+    batch: Batch,
+    points: int,
+    parameters: Sequence[nn.Parameter],
+    threads: int = 1,
+) -> tuple[Tensor, Parts]:
+    """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
+
+    A batch of more than `points` samples is differentiated in here, piece by piece; `backward` only has to
+    hand the sum over. The plain twin is `parts_of(batch)`.
+
+    Args:
+        parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.
+        batch: to be split.
+        points: samples that are worked on together, >= 1.
+        parameters: what the loss is differentiated by; all take part in it.
+        threads: each differentiates pieces of its own, >= 1; `parts_of` is called from all of them.
+    """
+    if batch.sdf.numel() <= points:
+        parts = parts_of(batch)
+        return torch.stack(tuple(parts.values())).sum(), parts
+
+    def weighted(piece: Batch, of_samples: float, of_normals: float, seed: int | None) -> Parts:
+        with drawn_from(seed):
+            parts = parts_of(piece)
+        return {name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()}
+
+    cut = list(pieces(batch, points))
+    seeds = [None] * len(cut)
+    if batch.sdf.is_cpu:  # here, in order: threads take turns as they like
+        seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()
+    each = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
+    totals: Parts = {}
+    return _Summed.apply([each[thread::threads] for thread in range(threads)], totals, *parameters), totals
+
+
+class _Summed(torch.autograd.Function):
+    """The sum of losses, differentiated while it is summed, so that one graph a thread lives at a time."""
+
+    @staticmethod
+    def forward(ctx, shares: Sequence[Share], totals: Parts, *parameters: Tensor) -> Tensor:
+        shares = [share for share in shares if share]
+        found = side_by_side(lambda share: _differentiated(share, parameters), shares)
+        (sums, ctx.gradients), *others = found
+        totals.update(sums)
+        for sums, gradients in others:
+            torch._foreach_add_(ctx.gradients, gradients)
+            for name, part in sums.items():
+                totals[name] = totals[name] + part
+        return torch.stack(tuple(totals.values())).sum()
+
+    @staticmethod
+    def backward(ctx, by_loss: Tensor):
+        return None, None, *torch._foreach_mul(ctx.gradients, by_loss)
+
+
+def _differentiated(share: Share, parameters: Sequence[Tensor]) -> tuple[Parts, list[Tensor]]:
+    """Sums of the parts of the loss over pieces, and its gradient."""
+    totals: Parts = {}
+    gradients: list[Tensor] = []
+    for parts_of_piece in share:
+        with torch.enable_grad():
+            parts = parts_of_piece()
+            loss = torch.stack(tuple(parts.values())).sum()
+        with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
+            found = torch.autograd.grad(loss, parameters)
+        if gradients:
+            torch._foreach_add_(gradients, found)
+        else:
+            gradients = list(found)
+        for name, part in parts.items():
+            totals[name] = totals.get(name, 0) + part.detach()
+    return totals, gradients

@@ -1,0 +1,67 @@
+"""The five categories by name, and the mesh of any of their shapes."""
+
+import numpy as np
+from manifold3d import Manifold
+
+from sdfhub.errors import SdfhubError
+from sdfhub.procedural import chairs, lamps, planes, sofas, tables
+from sdfhub.procedural.parameters import draw
+
+VERSION = 3
+"""Raised whenever a generator changes what it makes; stores hash it."""
+
+_DESIGNS = {
+    "chairs": (1, chairs.Chair),
+    "lamps": (2, lamps.Lamp),
+    "planes": (3, planes.Plane),
+    "sofas": (4, sofas.Sofa),
+    "tables": (5, tables.Table),
+}  # the code seeds the draw: never reuse or change one
+
+CATEGORIES = tuple(_DESIGNS)
+
+
+def design(category: str, index: int):
+    """The parameters of shape `index` of a category, as its frozen dataclass; `.build()` makes the solid.
+
+    Args:
+        category: one of CATEGORIES.
+        index: >= 0; the same index always gives the same design.
+
+    Raises:
+        SdfhubError: for an unknown category or a negative index.
+    """
+    if category not in _DESIGNS:
+        raise SdfhubError(f"category={category}: no such procedural category; choose {', '.join(CATEGORIES)}")
+    if index < 0:
+        raise SdfhubError(f"index={index}: procedural shapes are counted from 0")
+    code, kind = _DESIGNS[category]
+    return draw(kind, np.random.default_rng([code, index]))
+
+
+def generate(category: str, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh of shape `index` of a category: closed, oriented outwards, one shell.
+
+    Args:
+        category: one of CATEGORIES.
+        index: >= 0; the same index always gives the same shape.
+
+    Returns:
+        vertices: [V, 3] float64, metres, +z up, front towards -y.
+        faces: [F, 3] int64, counter-clockwise seen from outside.
+
+    Raises:
+        SdfhubError: for an unknown category or a negative index.
+    """
+    mesh = _outer_shell(design(category, index).build()).to_mesh64()
+    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
+    return vertices, np.array(mesh.tri_verts, dtype=np.int64)
+
+
+def _outer_shell(solid: Manifold) -> Manifold:
+    """The solid without pockets closed in between its parts and without slivers that a boolean split off."""
+    pieces = solid.decompose()
+    if len(pieces) == 1:
+        return solid
+    least = 1e-5 * solid.volume()
+    return Manifold.compose([piece for piece in pieces if piece.volume() > least])

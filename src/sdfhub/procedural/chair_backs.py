@@ -1,0 +1,135 @@
+"""Backrests of chairs: a surface that leans and bows, and what is built along it."""
+
+import numpy as np
+from manifold3d import Manifold
+
+from sdfhub.procedural import parts
+
+_RAIL = 0.022  # thickness of rails and posts of light backs
+
+
+def back(chair) -> list[Manifold]:
+    """The parts of the chair's backrest, rooted in its seat."""
+    styles = {
+        "slats": _slats,
+        "spindles": _spindles,
+        "ladder": _ladder,
+        "solid": _solid,
+        "hoop": _hoop,
+        "panel": _panel,
+    }
+    return styles[chair.back](chair)
+
+
+def point(chair, side: float, height: float) -> np.ndarray:
+    """A point of the back's middle surface.
+
+    Args:
+        chair: whose back it is.
+        side: from -1 (left post) to 1 (right post).
+        height: above the seat in metres; the bow and the lean grow with it.
+    """
+    h = height / chair.back_height
+    if chair.seat == "round":
+        x = 0.8 * chair.seat_width / 2 * side
+        y = chair.seat_depth / 2 * np.sqrt(1 - (0.8 * side) ** 2) - 0.03
+    else:
+        y = chair.seat_depth / 2 - 0.026
+        x = (chair.half_width(y) - 0.028) * side
+    y += chair.back_lean * max(h, 0) ** 1.3 + chair.back_curve * (1 - side**2) * np.clip(h, 0, 1) ** 0.7
+    return np.array([x * (1 + 0.06 * h), y, chair.seat_height + height])
+
+
+def side_at(chair, height: float) -> float:
+    """Where the outermost post stands at a height, as the `side` of `point`."""
+    if chair.back != "hoop":
+        return 1.0
+    return float((1 - (height / chair.back_height) ** 2.6) ** (1 / 2.6))
+
+
+def _upright(chair, side: float, top: float, section: np.ndarray) -> Manifold:
+    heights = np.linspace(-0.5 * chair.seat_thickness, top, 7)
+    path = np.array([point(chair, side, h) for h in heights])
+    return parts.sweep(path, section, up=(0, 1, 0))
+
+
+def _rail(chair, height: float, tall: float, thick: float, crest: float = 0.0) -> Manifold:
+    """A curved rail from post to post; `crest` raises its middle."""
+    sides = np.linspace(-1, 1, 13)
+    path = np.array([point(chair, s, height + crest * (1 - s * s)) for s in sides])
+    return parts.sweep(path, parts.rounded_rectangle(thick, tall, 0.3 * thick))
+
+
+def _posts(chair) -> list[Manifold]:
+    w = max(0.8 * chair.leg_width, 0.026)
+    square = chair.legs in ("square", "sled")
+    section = parts.rounded_rectangle(w, w, 0.12 * w) if square else 0.5 * w * parts.circle(14)
+    return [_upright(chair, side, chair.back_height, section) for side in (-1, 1)]
+
+
+def _slats(chair) -> list[Manifold]:
+    """Flat vertical boards between two rails."""
+    low, high = 0.16 * chair.back_height, chair.back_height - 0.03
+    made = [*_posts(chair), _rail(chair, low, 0.035, _RAIL), _rail(chair, high, 0.06, _RAIL + 0.006)]
+    width = min(0.05, 0.9 * chair.seat_width / (chair.slats + 1) * 0.6)
+    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
+        path = np.array([point(chair, side, h) for h in np.linspace(low, high, 5)])
+        made.append(parts.sweep(path, parts.rounded_rectangle(width, 0.014, 0.004), up=(0, 1, 0)))
+    return made
+
+
+def _spindles(chair) -> list[Manifold]:
+    """Turned rods from the seat into a crest rail."""
+    high = chair.back_height - 0.02
+    made = [*_posts(chair), _rail(chair, high, 0.075, _RAIL + 0.004, crest=0.025)]
+    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
+        made.append(_upright(chair, side, high, chair.spindle_width / 2 * parts.circle(10)))
+    return made
+
+
+def _ladder(chair) -> list[Manifold]:
+    """Bowed horizontal slats between the posts."""
+    count = max(2, chair.slats - 2)
+    heights = np.linspace(0.28, 1, count) * chair.back_height - 0.035
+    tall = min(0.07, 0.55 * (heights[1] - heights[0]))
+    return [*_posts(chair), *(_rail(chair, h, tall, 0.02, crest=0.014) for h in heights)]
+
+
+def _shell(chair, low: float, thick: float, round_top: float) -> Manifold:
+    """A curved panel between two heights; its upper corners fall by `round_top`."""
+    sections = []
+    for side in np.linspace(-1.04, 1.04, 17):
+        top = chair.back_height - round_top * np.abs(side / 1.04) ** 6
+        ring = []
+        for h in np.linspace(low, top, 6):
+            ring.append(point(chair, side, h) - [0, thick / 2, 0])
+        for h in np.linspace(top, low, 6):
+            ring.append(point(chair, side, h) + [0, thick / 2, 0])
+        sections.append(ring)
+    return parts.loft(np.array(sections))
+
+
+def _solid(chair) -> list[Manifold]:
+    """A curved shell that grows out of the seat."""
+    return [_shell(chair, -0.4 * chair.seat_thickness, chair.back_thickness, 0.3 * chair.back_height)]
+
+
+def _panel(chair) -> list[Manifold]:
+    """A panel held clear of the seat by two posts."""
+    return [*_posts(chair), _shell(chair, 0.38 * chair.back_height, chair.back_thickness, 0.03)]
+
+
+def _hoop(chair) -> list[Manifold]:
+    """A bent bow with rods inside it."""
+    angle = np.linspace(0, np.pi, 29)
+    power = 2 / 2.6
+    sides = np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power
+    heights = chair.back_height * np.sin(angle) ** power
+    path = [point(chair, s, h) for s, h in zip(sides, heights, strict=True)]
+    root = np.array([0, 0, -0.5 * chair.seat_thickness])
+    path = np.array([path[0] + root, *path, path[-1] + root])
+    made = [parts.tube(path, max(0.42 * chair.leg_width, 0.0125), 12, up=(0, 1, 0))]
+    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
+        top = chair.back_height * (1 - abs(side) ** 2.6) ** (1 / 2.6)
+        made.append(_upright(chair, side, top, chair.spindle_width / 2 * parts.circle(10)))
+    return made

@@ -1,0 +1,213 @@
+"""Chairs: dining, Windsor, ladder-back, bentwood, cantilever, swivel, tulip, from one set of parameters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import Manifold
+
+from sdfhub.procedural import chair_backs, parts
+from sdfhub.procedural.parameters import choice, continuous
+
+_FOUR_LEGS = ("square", "turned", "round")
+
+
+@dataclass(frozen=True)
+class Chair:
+    """One chair. Lengths in metres; seat, back and legs combine freely."""
+
+    seat_height: float = continuous(0.40, 0.50)
+    seat_width: float = continuous(0.40, 0.56)
+    seat_depth: float = continuous(0.38, 0.50)
+    seat_thickness: float = continuous(0.025, 0.075)
+    seat_taper: float = continuous(0.74, 0.98)
+    back_height: float = continuous(0.34, 0.62)
+    back_lean: float = continuous(0.03, 0.14)
+    back_curve: float = continuous(0.0, 0.07)
+    back_thickness: float = continuous(0.018, 0.05)
+    leg_width: float = continuous(0.028, 0.046)
+    leg_taper: float = continuous(0.5, 0.95)
+    leg_splay: float = continuous(0.0, 0.075)
+    stretcher_height: float = continuous(0.22, 0.5)
+    arm_height: float = continuous(0.17, 0.25)
+    spindle_width: float = continuous(0.017, 0.025)
+    seat: str = choice("square", "tapered", "round")
+    back: str = choice("slats", "spindles", "ladder", "solid", "hoop", "panel")
+    legs: str = choice("square", "square", "turned", "round", "round", "sled", "cantilever", "star", "tulip")
+    arms: str = choice("none", "none", "none", "straight", "curved")
+    stretchers: str = choice("none", "none", "sides", "h", "box")
+    apron: bool = choice(True, False)
+    slats: int = choice(3, 4, 5, 6, 7)
+
+    def build(self) -> Manifold:
+        """The chair as one solid, standing on z = 0."""
+        return parts.union([self._seat(), *self._base(), *chair_backs.back(self), *self._arms()])
+
+    def outline(self) -> np.ndarray:
+        """[N, 2] of the seat, its front at -y."""
+        if self.seat == "round":
+            return parts.circle(40) * np.array([self.seat_width, self.seat_depth]) / 2
+        if self.seat == "tapered":
+            back = self.seat_width * self.seat_taper
+            return parts.rounded_rectangle(self.seat_width, self.seat_depth, 0.05, back)
+        return parts.rounded_rectangle(self.seat_width, self.seat_depth, 0.02)
+
+    def half_width(self, y: float) -> float:
+        """Half the seat's width at depth y."""
+        along = y / self.seat_depth + 0.5
+        if self.seat == "round":
+            return self.seat_width / 2 * np.sqrt(max(0.0, 1 - (2 * along - 1) ** 2))
+        taper = self.seat_taper if self.seat == "tapered" else 1.0
+        return self.seat_width / 2 * (1 - along * (1 - taper))
+
+    def _seat(self) -> Manifold:
+        top, bottom = self.seat_height, self.seat_height - self.seat_thickness
+        return parts.pad(self.outline(), bottom, top, 0.4 * self.seat_thickness)
+
+    def _base(self) -> list[Manifold]:
+        if self.legs in _FOUR_LEGS:
+            return self._four_legs()
+        return {"sled": self._sled, "cantilever": self._cantilever, "star": self._star, "tulip": self._tulip}[
+            self.legs
+        ]()
+
+    def _leg_ends(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(top, foot) of the four legs: front left, front right, back left, back right."""
+        z, inset = self.seat_height - 0.4 * self.seat_thickness, 0.7 * self.leg_width
+        reach = 0.32 if self.seat == "round" else 0.5
+        ends = []
+        for y in (-reach * self.seat_depth + inset, reach * self.seat_depth - inset):
+            for side in (-1, 1):
+                x = side * (self.half_width(y) - inset * 1.1)
+                foot = (x + side * self.leg_splay * 0.7, y + np.sign(y) * self.leg_splay, 0.0)
+                ends.append((np.array([x, y, z]), np.array(foot)))
+        return ends
+
+    def _four_legs(self) -> list[Manifold]:
+        ends = self._leg_ends()
+        made = [self._leg(top, foot) for top, foot in ends]
+        if self.apron and self.legs != "round":
+            made += self._apron([top for top, _ in ends])
+        return made + self._stretchers(ends)
+
+    def _leg(self, top: np.ndarray, foot: np.ndarray) -> Manifold:
+        w = self.leg_width
+        if self.legs == "square":
+            return parts.square_bar(foot, top, w * self.leg_taper, w)
+        if self.legs == "round":
+            return parts.bar(foot, top, 0.5 * w * self.leg_taper, 0.55 * w)
+        r, t = 0.56 * w, self.leg_taper
+        profile = [
+            (0.6, 0),
+            (0.75, 0.03),
+            (0.6, 0.07),
+            (0.5, 0.1),
+            (0.62 + 0.2 * t, 0.3),
+            (0.95, 0.5),
+            (0.95, 0.56),
+        ]
+        profile += [
+            (0.55, 0.6),
+            (0.9, 0.63),
+            (0.9, 0.65),
+            (0.55, 0.68),
+            (0.95, 0.72),
+            (1.0, 0.76),
+            (1.0, 1.0),
+        ]
+        return parts.turned(foot, top, [(r * a, h) for a, h in profile])
+
+    def _apron(self, tops: list[np.ndarray]) -> list[Manifold]:
+        height = 0.045
+        made = []
+        for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)):
+            start, end = tops[a].copy(), tops[b].copy()
+            start[2] = end[2] = self.seat_height - self.seat_thickness - height / 2 + 0.008
+            made.append(parts.plank(start, end, 0.018, height + 0.016))
+        return made
+
+    def _stretchers(self, ends: list[tuple[np.ndarray, np.ndarray]]) -> list[Manifold]:
+        def at(leg: int, share: float) -> np.ndarray:
+            top, foot = ends[leg]
+            return foot + share * (top - foot)
+
+        def rod(start, end) -> Manifold:
+            if self.legs == "square":
+                return parts.plank(start, end, 0.018, 0.026)
+            return parts.turned(start, end, [(0.009, 0), (0.013, 0.5), (0.009, 1)])
+
+        h = self.stretcher_height
+        if self.stretchers == "none":
+            return []
+        made = [rod(at(0, h), at(2, h)), rod(at(1, h), at(3, h))]
+        if self.stretchers == "h":
+            made.append(rod((at(0, h) + at(2, h)) / 2, (at(1, h) + at(3, h)) / 2))
+        if self.stretchers == "box":
+            made += [rod(at(0, h), at(1, h)), rod(at(2, h), at(3, h))]
+        return made
+
+    def _sled(self) -> list[Manifold]:
+        """Two closed loops of tube, one a side, joined by bars under the seat."""
+        r, z = 0.34 * self.leg_width, self.seat_height - 0.6 * self.seat_thickness
+        reach = 0.30 if self.seat == "round" else 0.44
+        made = []
+        for side in (-1, 1):
+            top = np.array(
+                [
+                    (side * (self.half_width(y) - 1.5 * r), y, z)
+                    for y in self.seat_depth * reach * np.array([-1, 1])
+                ]
+            )
+            out = np.array([side * 0.4 * self.leg_splay, 0, 0])
+            floor = top + out + np.array([[0, -0.5 * self.leg_splay - 0.01, r - z], [0, 0.06, r - z]])
+            path = parts.filleted([top[0], floor[0], floor[1], top[1]], 0.05)
+            made.append(parts.tube(path, r, up=(1, 0, 0)))
+        return made
+
+    def _cantilever(self) -> list[Manifold]:
+        """A bent tube: along the floor, up at the front, back below the seat."""
+        r, z = 0.36 * self.leg_width, self.seat_height - 0.75 * self.seat_thickness
+        front, back = -self.seat_depth / 2 - self.leg_splay / 2, self.seat_depth * 0.5
+        x = min(self.half_width(0.25 * self.seat_depth), self.half_width(-0.25 * self.seat_depth)) - 1.2 * r
+        corners = [(x, back, r), (x, front, r), (x, front, z), (x, 0.25 * self.seat_depth, z)]
+        side = parts.tube(parts.filleted(corners, 0.09, 6), r, up=(1, 0, 0))
+        cross = parts.bar((-x, back - r, r), (x, back - r, r), r)
+        support = parts.bar((-x, 0.1 * self.seat_depth, z), (x, 0.1 * self.seat_depth, z), r)
+        return [*parts.mirrored(side), cross, support]
+
+    def _star(self) -> list[Manifold]:
+        """A gas lift on five castors."""
+        z, reach = self.seat_height - 0.5 * self.seat_thickness, 0.26 + 0.6 * self.leg_splay
+        made = [parts.lathe([(0.026, 0.075), (0.026, 0.62 * z), (0.017, 0.62 * z + 0.01), (0.017, z)])]
+        made.append(parts.lathe([(0.038, 0.07), (0.042, 0.1), (0.026, 0.14)]))
+        made.append(parts.lathe([(0.03, z - 0.06), (0.11, z - 0.02), (0.11, z)]))
+        for angle in 2 * np.pi * np.arange(5) / 5 - np.pi / 2:
+            tip = reach * np.array([np.cos(angle), np.sin(angle), 0]) + np.array([0, 0, 0.062])
+            made.append(parts.bar((0, 0, 0.1), tip, 0.62 * self.leg_width, 0.42 * self.leg_width))
+            made.append(parts.ellipsoid((0.03, 0.03, 0.03), tip - np.array([0, 0, 0.032]), 16))
+            made.append(parts.ellipsoid((0.018, 0.018, 0.02), tip, 12))
+        return made
+
+    def _tulip(self) -> list[Manifold]:
+        """A disc that flares into one stem and opens below the seat."""
+        z, foot = self.seat_height - 0.5 * self.seat_thickness, 0.2 + self.leg_splay
+        stem = 0.7 * self.leg_width
+        t = np.linspace(0, 1, 14)
+        radius = stem + (foot - stem) * (1 - t) ** 5 + (0.42 * foot - stem) * t**7
+        height = 0.018 + (z - 0.018) * t
+        return [parts.lathe([(foot, 0.0), *zip(radius, height, strict=True)], 32)]
+
+    def _arms(self) -> list[Manifold]:
+        if self.arms == "none":
+            return []
+        behind = chair_backs.point(self, chair_backs.side_at(self, self.arm_height), self.arm_height)
+        y = -0.24 * self.seat_depth
+        x, z = self.half_width(y) - 0.024, self.seat_height + self.arm_height
+        seat = np.array([x, y, self.seat_height - 0.4 * self.seat_thickness])
+        wide = max(x, behind[0]) + 0.02
+        if self.arms == "curved":
+            corners = [behind, (wide, 0.3 * y, z + 0.01), (wide, y - 0.05, z - 0.01), seat]
+            return parts.mirrored(
+                parts.tube(parts.filleted(corners, 0.06, 5), 0.4 * self.leg_width, up=(1, 0, 0.2))
+            )
+        rest = parts.plank(behind + [0, 0.01, 0], (x, y - 0.05, z), 0.045, 0.024)
+        return [*parts.mirrored(rest), *parts.mirrored(parts.square_bar(seat, (x, y, z), 0.03))]

@@ -1,0 +1,172 @@
+"""Shades of lamps: thin open shells, the bulb inside them and the wires that hold them."""
+
+import numpy as np
+from manifold3d import Manifold
+
+from sdfhub.procedural import parts
+
+_THIRDS = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
+
+
+def height(lamp) -> float:
+    """Height of the lamp's shade in metres."""
+    share = {"dome": 0.72, "globe": 1.3, "bowl": 0.5, "drum": 0.9}.get(lamp.shade, 1.0)
+    return min(share * lamp.shade_height, 0.96 if lamp.shade == "globe" else 2.0) * lamp.shade_diameter()
+
+
+def head(lamp, hung: bool) -> Manifold:
+    """The shade with its bulb and fitting; the axis is z, the lower rim of the shade lies at z = 0.
+
+    Args:
+        lamp: whose head it is.
+        hung: held from above by a rod that ends above the shade; else from below by one that ends under it.
+    """
+    tall, gauge = height(lamp), lamp.gauge()
+    closed = {"dome": _dome, "globe": _globe, "bowl": _bowl}
+    if lamp.shade in closed:
+        return parts.union(closed[lamp.shade](lamp, tall, gauge, hung))
+    return parts.union(_open(lamp, tall, gauge, hung))
+
+
+def _rod(bottom: float, top: float, radius: float) -> Manifold:
+    return parts.lathe([(radius, bottom), (radius, top)], 14)
+
+
+def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold]:
+    """A bulb and its socket; `up` tells on which side of the socket the bulb is."""
+    sign = 1 if up else -1
+    ends = sorted([centre, centre - sign * 1.75 * radius])
+    socket = max(0.55 * radius, 1.5 * gauge)
+    return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), _rod(*ends, socket)]
+
+
+def _radius(lamp, share: np.ndarray) -> np.ndarray:
+    """Radius of an open shade at a share of its height."""
+    wide = lamp.shade_diameter() / 2
+    if lamp.shade == "drum":
+        return wide * (1 - 0.25 * (1 - lamp.shade_taper) * share)
+    if lamp.shade == "bell":
+        return wide * (lamp.shade_taper + (1 - lamp.shade_taper) * (1 - share) ** 2.2) * (1 - 0.08 * share)
+    return wide * (1 - (1 - lamp.shade_taper) * share)
+
+
+def _pleated(lamp, tall: float) -> Manifold:
+    """A cone whose wall is folded into sharp pleats."""
+    fold = np.where(np.arange(2 * lamp.pleats) % 2, 1 - 0.9 / lamp.pleats, 1.0)[:, None]
+    ring = parts.circle(2 * lamp.pleats) * fold
+
+    def solid(offset: float, overshoot: float) -> Manifold:
+        shares = np.array([-overshoot, 1 + overshoot])
+        rings = [
+            np.column_stack([(r + offset) * ring, np.full(len(ring), s * tall)])
+            for s, r in zip(shares, _radius(lamp, shares), strict=True)
+        ]
+        return parts.loft(np.array(rings))
+
+    wall = lamp.wall_thickness()
+    return solid(0.6 * wall, 0.0) - solid(-0.6 * wall, 0.05)
+
+
+def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
+    """A shade open at both ends, on a spider of three wires."""
+    wall = lamp.wall_thickness()
+    if lamp.shade == "pleated":
+        shell = _pleated(lamp, tall)
+    else:
+        share = np.linspace(0, 1, 12 if lamp.shade == "bell" else 2)
+        shell = parts.revolve_shell(np.column_stack([_radius(lamp, share), tall * share]), wall, 40)
+    size = 0.2 * lamp.shade_diameter() * lamp.shade_taper
+    at = 0.9
+    made = [shell, *_spider(lamp, tall, at, gauge)]
+    if hung:
+        return [*made, *_bulb(0.45 * tall, size, gauge, False), _rod(0.5 * tall, tall + 2 * gauge, gauge)]
+    made += _bulb(0.42 * tall, size, gauge, True)
+    if lamp.fitting == "harp":
+        made += _harp(tall, at, gauge, 1.45 * size)
+        made.append(_rod(-2 * gauge, 0.42 * tall, gauge))
+    else:
+        made.append(_rod(-2 * gauge, at * tall, gauge))
+    if lamp.fitting == "rings":
+        made += _spider(lamp, tall, 0.08, gauge)
+    if lamp.finial:
+        top = at * tall
+        made += [
+            _rod(top - gauge, top + 3 * gauge, 0.9 * gauge),
+            parts.ellipsoid((1.9 * gauge, 1.9 * gauge, 2.3 * gauge), (0, 0, max(top + 4 * gauge, tall)), 16),
+            _rod(top, max(top + 4 * gauge, tall), 0.9 * gauge),
+        ]
+    return made
+
+
+def _spider(lamp, tall: float, share: float, gauge: float) -> list[Manifold]:
+    reach, z = float(_radius(lamp, np.array(share))), share * tall
+    reach *= 1 - (0.9 / lamp.pleats if lamp.shade == "pleated" else 0.0)
+    wires = [parts.bar((0, 0, z), (reach * np.cos(a), reach * np.sin(a), z), 0.8 * gauge) for a in _THIRDS]
+    return [*wires, _rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]
+
+
+def _harp(tall: float, share: float, gauge: float, wide: float) -> list[Manifold]:
+    """Two bent wires around the bulb from the socket to the spider."""
+    low, high = 0.06 * tall, share * tall
+    corners = [(0, 0, low), (wide, 0, low + 0.3 * (high - low)), (0.9 * wide, 0, high - 0.3 * wide)]
+    path = parts.filleted([*corners, (0, 0, high)], 0.3 * wide)
+    return parts.mirrored(parts.tube(path, 0.8 * gauge, 10, up=(0, 1, 0)))
+
+
+def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
+    """A dome closed by a cap, where the rod holds it."""
+    wide, cap = lamp.shade_diameter() / 2, 2.4 * gauge
+    angle = np.linspace(0, 0.5 * np.pi, 13)
+    power = 0.7 + 0.6 * lamp.shade_taper
+    radius = 0.7 * cap + (wide - 0.7 * cap) * np.cos(angle) ** power
+    profile = np.column_stack([radius, tall * np.sin(angle)])
+    size = min(0.36 * wide, 0.3 * tall)
+    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
+    made.append(
+        parts.lathe([(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)])
+    )
+    if hung:
+        made += [*_bulb(0.42 * tall, size, gauge, False), _rod(0.42 * tall, tall + 4 * gauge, gauge)]
+    else:
+        made += [*_bulb(0.4 * tall, size, gauge, True), _rod(-2 * gauge, tall, gauge)]
+    return made
+
+
+def _globe(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
+    """A ball of glass, open opposite to the collar that holds it."""
+    wide, cap = lamp.shade_diameter() / 2, 3.2 * gauge
+    first, last = np.arcsin(0.7 * cap / wide), np.pi - np.arcsin(0.3 + 0.45 * lamp.shade_taper)
+    angle = np.linspace(first, last, 19)
+    profile = np.column_stack([wide * np.sin(angle), tall / 2 * (1 - np.cos(angle))])
+    lift = 0.6 * gauge
+    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 36)]
+    made.append(parts.lathe([(0.9 * gauge, -3 * gauge), (cap, -1.5 * gauge), (1.2 * cap, 2.4 * gauge)]))
+    made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, True), _rod(-3.5 * gauge, 0.4 * tall, gauge)]
+    ball = parts.union(made).translate((0, 0, lift))
+    return [ball.rotate((180, 0, 0)).translate((0, 0, tall))] if hung else [ball]
+
+
+def _bowl(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
+    """A bowl that throws its light up; hung, it is carried by three rods."""
+    wide, cap = lamp.shade_diameter() / 2, 2.6 * gauge
+    share = np.linspace(0, 1, 12)
+    radius = 0.7 * cap + (wide - 0.7 * cap) * share
+    profile = np.column_stack([radius, tall * share ** (1.3 + 1.5 * lamp.shade_taper)])
+    size = min(0.3 * wide, 0.3 * tall)
+    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
+    made.append(parts.lathe([(gauge, -3 * gauge), (1.2 * cap, -gauge), (1.3 * cap, 2 * gauge)]))
+    made.append(_rod(0, 0.5 * tall, gauge))
+    made += _bulb(0.5 * tall, size, gauge, True)
+    if not hung:
+        return [*made, _rod(-4 * gauge, 0, gauge)]
+    apex = tall + 1.1 * wide
+    for a in _THIRDS:
+        rim = np.array([0.97 * wide * np.cos(a), 0.97 * wide * np.sin(a), 0.97 * tall])
+        made.append(parts.bar(rim, (0, 0, apex), 0.8 * gauge))
+    return [*made, parts.ellipsoid((2 * gauge,) * 3, (0, 0, apex), 16), _rod(apex, apex + 3 * gauge, gauge)]
+
+
+def top(lamp) -> float:
+    """Height at which a hung head ends, above its shade's lower rim."""
+    extra = 0.55 * lamp.shade_diameter() if lamp.shade == "bowl" else 0.0
+    return height(lamp) + extra + 2 * lamp.gauge()

@@ -1,0 +1,236 @@
+"""What aircraft are made of: a fuselage, lifting surfaces, nacelles, propellers, wheels.
+
+Lengths are in fuselage lengths: the nose is at y = -0.5 and the tail at y = 0.5.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from manifold3d import Manifold
+
+from sdfhub.procedural import parts
+
+
+@dataclass(frozen=True)
+class Fuselage:
+    """A body along y whose section is a superellipse.
+
+    Args:
+        radius: half the width of the cabin.
+        tall: height over width.
+        nose, tail: lengths over which the section grows and shrinks.
+        tip, end: section at the nose and at the tail, as shares of the cabin's.
+        bluntness: exponent of the nose; 0.5 is an ellipse, 0.9 nearly a cone.
+        boom: exponent of the tail; above 1 the body stays full for longer, below 1 it thins out early.
+        square: exponent of the section; 2 is an ellipse.
+        upsweep: rise of the tail's axis; at 1 the roof stays level.
+        droop: fall of the nose's axis, likewise.
+    """
+
+    radius: float
+    tall: float
+    nose: float
+    tail: float
+    tip: float
+    end: float
+    bluntness: float
+    boom: float
+    square: float
+    upsweep: float
+    droop: float
+
+    def share(self, y: float) -> float:
+        """The section at y as a share of the cabin's."""
+        ahead, behind = self._phases(y)
+        nose = self.tip + (1 - self.tip) * (1 - ahead**2) ** self.bluntness
+        smooth = behind * behind * (3 - 2 * behind)
+        return nose * (1 - (1 - self.end) * smooth**self.boom)
+
+    def half_width(self, y: float) -> float:
+        """Half the width at y."""
+        return self.radius * self.share(y)
+
+    def half_height(self, y: float) -> float:
+        """Half the height at y."""
+        return self.tall * self.radius * self.share(y)
+
+    def axis(self, y: float) -> float:
+        """Height of the section's centre at y; 0 in the cabin."""
+        ahead, behind = self._phases(y)
+        missing = self.tall * self.radius * (1 - self.share(y))
+        return missing * (self.upsweep * (behind > 0) - self.droop * (ahead > 0))
+
+    def top(self, y: float) -> float:
+        """Height of the roof at y."""
+        return self.axis(y) + self.half_height(y)
+
+    def solid(self, segments: int = 24) -> Manifold:
+        """The body, its nose and tail closed by small discs."""
+        stretch = np.linspace(0.07, 1, 10) ** 2
+        nose, tail = -0.5 + self.nose * stretch, 0.5 - self.tail * np.linspace(1, 0, 11)
+        body = [self._ring(y, segments) for y in (*nose, *tail[tail > nose[-1] + 0.005])]
+        cap = self._ring(0.5, segments)
+        centre = cap.mean(0)
+        for share in (0.8, 0.4):
+            body.append(centre + (cap - centre) * share + [0, 0.6 * self.radius * self.end * (1 - share), 0])
+        return parts.loft(np.array(body))
+
+    def _phases(self, y: float) -> tuple[float, float]:
+        """How far y lies into the nose and into the tail, each 0 in the cabin and 1 at the end."""
+        ahead, behind = (self.nose - 0.5 - y) / self.nose, (y - 0.5 + self.tail) / self.tail
+        return min(max(ahead, 0.0), 1.0), min(max(behind, 0.0), 1.0)
+
+    def _ring(self, y: float, segments: int) -> np.ndarray:
+        unit = superellipse(segments, self.square)
+        x, z = self.half_width(y) * unit[:, 0], self.axis(y) + self.half_height(y) * unit[:, 1]
+        return np.column_stack([x, np.full(segments, y), z])
+
+
+def superellipse(segments: int, power: float) -> np.ndarray:
+    """[segments, 2] points of |x|^power + |y|^power = 1, counter-clockwise."""
+    unit = parts.circle(segments)
+    return np.sign(unit) * np.abs(unit) ** (2 / power)
+
+
+@dataclass(frozen=True)
+class Station:
+    """One section of a lifting surface: leading edge, chord, and the roll of its thickness (0: a wing's)."""
+
+    leading_edge: tuple[float, float, float]
+    chord: float
+    roll: float = 0.0
+
+
+def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """A section of unit chord and unit thickness.
+
+    Source: NACA report 460, thickness of the four-digit sections.
+
+    Returns:
+        along: [points] from leading to trailing edge.
+        half: [points] half thickness, 0.5 at its greatest.
+    """
+    x = (1 - np.cos(np.linspace(0, np.pi, points))) / 2
+    powers = np.stack([np.sqrt(x), x, x**2, x**3, x**4])
+    return x, 5 * np.array([0.2969, -0.126, -0.3516, 0.2843, -0.1036]) @ powers
+
+
+def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
+    """A wing, fin or tailplane through its stations, with a blunt trailing edge.
+
+    Args:
+        stations: from end to end.
+        ratio: thickness over chord.
+        gauge: least thickness; the trailing edge has 0.8 of it.
+        camber: of the mean line, in chords.
+    """
+    along, half = aerofoil()
+    sections = []
+    for s in stations:
+        thick = max(ratio * s.chord, 1.15 * gauge)
+        offset = np.maximum(thick * half, 0.4 * gauge * np.minimum(1, 4 * np.sqrt(along)))
+        mean = 4 * camber * s.chord * along * (1 - along)
+        y = np.concatenate([along, along[:0:-1]]) * s.chord
+        up = np.concatenate([mean + offset, (mean - offset)[:0:-1]])
+        across = np.outer(up, [-np.sin(s.roll), 0, np.cos(s.roll)])
+        sections.append(np.array(s.leading_edge) + across + np.outer(y, [0, 1, 0]))
+    return parts.loft(np.array(sections))
+
+
+def panel(root, direction, length: float, chords, sweep: float, ratio: float, gauge: float) -> Manifold:
+    """A tapered swept surface with a rounded tip, from a leading-edge point along a direction.
+
+    Args:
+        root: [3] leading edge where it starts.
+        direction: [2] unit vector in x, z.
+        length: along the direction.
+        chords: at the root and at the tip.
+        sweep: of the leading edge, degrees.
+        ratio, gauge: as of `lifting_surface`.
+    """
+    roll = np.arctan2(direction[1], direction[0])
+    back = np.tan(np.radians(sweep))
+    stations = []
+    for share, trim in ((0, 0), (0.5, 0), (0.94, 0), (1, 0.14)):
+        chord = chords[0] + share * (chords[1] - chords[0])
+        x, z = np.array([root[0], root[2]]) + share * length * np.asarray(direction)
+        y = root[1] + share * length * back + trim * chord
+        stations.append(Station((x, y, z), chord * (1 - 1.4 * trim), roll))
+    return lifting_surface(stations, ratio, gauge)
+
+
+def body_of_revolution(profile, centre, segments: int = 18) -> Manifold:
+    """A lathe along y around `centre`; `profile` holds (radius, y) from the front axis to the rear axis."""
+    return parts.lathe(profile, segments).rotate((-90.0, 0.0, 0.0)).translate(tuple(map(float, centre)))
+
+
+def jet(radius: float, length: float, centre) -> Manifold:
+    """A turbofan nacelle with an open inlet, a spinner inside it and an exhaust cone."""
+    spinner = [(0.06, 0.1), (0.2, 0.15), (0.3, 0.28)]
+    inlet = [(0.66, 0.28), (0.7, 0.04), (0.78, 0.0), (0.86, 0.0)]
+    cowl = [(0.94, 0.03), (1.0, 0.16), (1.0, 0.4), (0.9, 0.7), (0.74, 0.86), (0.44, 0.87)]
+    cone = [(0.36, 0.98), (0.16, 1.12)]
+    profile = [(radius * q, length * t) for q, t in spinner + inlet + cowl + cone]
+    return body_of_revolution(profile, centre, 20)
+
+
+def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
+    """A pointed spinner and twisted blades in the plane y = centre[1].
+
+    Args:
+        radius: of the tips.
+        hub: radius of the spinner's foot.
+        blades: how many.
+        gauge: thickness of the blades.
+        centre: [3].
+        turn: angle of the first blade, degrees.
+    """
+    profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
+    made = [body_of_revolution([(hub * q, hub * t) for q, t in profile], centre, 14)]
+    chord = max(0.22 * radius, 2.2 * gauge)
+    sections = []
+    for share, width, twist in (
+        (0.0, 0.5, 60),
+        (0.3, 0.8, 45),
+        (0.6, 1.0, 28),
+        (0.92, 0.85, 18),
+        (1, 0.5, 16),
+    ):
+        ring = superellipse(10, 2.5) * [width * chord / 2, gauge / 2]
+        c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
+        flat = ring @ np.array([[c, s], [-s, c]])
+        sections.append(np.column_stack([flat, np.full(len(ring), share * radius)]))
+    blade = parts.loft(np.array(sections))
+    for k in range(blades):
+        made.append(blade.rotate((0.0, turn + 360.0 * k / blades, 0.0)).translate(tuple(map(float, centre))))
+    return made
+
+
+def wheel(radius: float, width: float, centre) -> Manifold:
+    """A tyre with rounded shoulders, its axle along x."""
+    r, w = radius, width / 2
+    profile = [(0.55 * r, -w), (0.84 * r, -w), (r, -0.5 * w), (r, 0.5 * w), (0.84 * r, w), (0.55 * r, w)]
+    return parts.lathe(profile, 16).rotate((0.0, 90.0, 0.0)).translate(tuple(map(float, centre)))
+
+
+def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
+    """A bubble that rises from a line along y: a fighter's canopy, a light aircraft's cabin.
+
+    Args:
+        front, back: its ends.
+        peak: where it is highest, as a share of its length.
+        base: function of y, the height it stands on.
+        half_width: at the peak.
+        height: above the base.
+    """
+    unit = superellipse(16, 2.4)
+    sections = []
+    for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 11))) / 2:
+        side = (peak - t) / peak if t < peak else (t - peak) / (1 - peak)
+        rise = (1 - side**2) ** 0.62
+        y = front + t * (back - front)
+        wide = half_width * (0.3 + 0.7 * rise)
+        ring = unit * [wide, 1.0]
+        z = base(y) + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
+        sections.append(np.column_stack([ring[:, 0], np.full(len(unit), y), z]))
+    return parts.loft(np.array(sections))

@@ -1,0 +1,195 @@
+"""Files of scans: meshes, point clouds with or without normals, signed samples. Read whole, checked once."""
+
+import io
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sdfhub.data.sources.deepsdf import npz_array, read_samples
+from sdfhub.data.sources.mesh_files import FORMATS as MESHES
+from sdfhub.data.sources.mesh_files import MAX_BYTES, check_length, read_mesh
+from sdfhub.errors import RejectedMesh, SdfhubError
+
+FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
+LEAST = 50
+"""Points from which a shape may be guessed."""
+
+_HEADER = re.compile(rb"\Aply\r?\n.*?end_header\r?\n", re.DOTALL)
+_FACES = re.compile(rb"^element\s+(?:face|tristrips)\s+[1-9]", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a file tells of one shape, in the file's frame and units.
+
+    Args:
+        points: [N, 3] float64: vertices, surface points, or places of signed samples.
+        normals: [N, 3] float64 outward normals of surface points, made unit; None where not known.
+        faces: [F, 3] int64 rows of `points`, of a mesh; else None.
+        sdf: [N] float64 of signed samples, negative inside, normalised frame; else None.
+        sensor: [3] float64, the place from which all points were seen; None where not known.
+        center: [3] float64 and scale of signed samples: `source = normalised / scale + center`.
+        scale: as above.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    sdf: np.ndarray | None = None
+    sensor: np.ndarray | None = None
+    center: np.ndarray | None = None
+    scale: float = 1.0
+
+    def __post_init__(self):
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype.kind != "f":
+            raise ValueError(f"points must be [N, 3] numbers, they are {list(self.points.shape)}")
+        if len(self.points) < LEAST and self.faces is None:
+            raise ValueError(f"holds {len(self.points)} points; at least {LEAST} are needed to know a shape")
+        for name, shape in (
+            ("normals", self.points.shape),
+            ("sdf", self.points.shape[:1]),
+            ("sensor", (3,)),
+            ("center", (3,)),
+        ):
+            part = getattr(self, name)
+            if part is not None and part.shape != shape:
+                raise ValueError(f"{name} must be {list(shape)} numbers, they are {list(part.shape)}")
+        for name in ("points", "normals", "sdf", "sensor", "center"):
+            part = getattr(self, name)
+            bad = 0 if part is None else int((~np.isfinite(part)).sum())
+            if bad:
+                raise ValueError(f"{bad} numbers of its {name} are not finite; remove those points")
+        if self.normals is not None:
+            lengths = np.linalg.norm(self.normals, axis=1, keepdims=True)
+            if not (lengths > 0).all():
+                raise ValueError("some of its normals are zero; remove them, or all normals")
+            object.__setattr__(self, "normals", self.normals / lengths)
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"scale must be a positive number, it is {self.scale}")
+        if self.sdf is not None and not (self.sdf.min() < 0 <= self.sdf.max()):
+            raise ValueError("its signed distances are all on one side; both sides are needed")
+
+    @property
+    def kind(self) -> str:
+        """What it is: mesh, samples, view, oriented or bare."""
+        if self.faces is not None:
+            return "mesh"
+        if self.sdf is not None:
+            return "samples"
+        if self.sensor is not None:
+            return "view"
+        return "bare" if self.normals is None else "oriented"
+
+
+def read_scan(path: str | Path) -> Scan:
+    """The scan in a file.
+
+    Meshes as in `read_mesh`; a .ply without faces is a cloud, with normals if its vertices have nx, ny, nz.
+    .xyz (text) and .npy: rows x y z or x y z nx ny nz. .npz: `pos` and `neg` are DeepSDF's samples; `points`
+    and `sdf` (and `center`, `scale`) are signed samples; `points`, and `normals` and `sensor` if there, are
+    a cloud.
+
+    Raises:
+        SdfhubError: one line that names the file and says what is wrong.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise SdfhubError(f"{path}: not a format of scans known here ({' '.join(FORMATS)})")
+    if not path.is_file():
+        raise SdfhubError(f"{path}: no such file")
+    if path.stat().st_size > MAX_BYTES:
+        raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
+    if not path.stat().st_size:
+        raise SdfhubError(f"{path}: the file is empty")
+    try:
+        return _READERS.get(path.suffix.lower(), _mesh)(path)
+    except RejectedMesh as rejection:
+        raise SdfhubError(rejection.detail) from rejection
+    except SdfhubError:
+        raise
+    except Exception as error:  # the readers raise whatever broken bytes lead to
+        what = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SdfhubError(f"{path}: {what}") from error
+
+
+def _mesh(path: Path) -> Scan:
+    vertices, faces = read_mesh(path)
+    return Scan(vertices, faces=faces)
+
+
+def _ply(path: Path) -> Scan:
+    content = path.read_bytes()
+    header = _HEADER.match(content)
+    if header is None:
+        raise SdfhubError(f"{path}: not a PLY file, or one that ends within its header")
+    if _FACES.search(header[0]):
+        return _mesh(path)
+    import trimesh  # here: slow to import
+
+    try:
+        check_length(content, ".ply")
+        cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+        columns = cloud.metadata["_ply_raw"]["vertex"]["data"]
+        rows = [np.asarray(columns[name], np.float64).reshape(-1) for name in _columns(columns)]
+    except Exception as error:  # whatever a cut or damaged file leads trimesh to
+        raise SdfhubError(f"{path}: cannot be read as ply; it may be cut off or damaged") from error
+    return _cloud(np.stack(rows, axis=1))
+
+
+def _columns(there) -> list[str]:
+    names = there.dtype.names if hasattr(there, "dtype") else there
+    wanted = ["x", "y", "z", "nx", "ny", "nz"]
+    return wanted if set(wanted) <= set(names) else wanted[:3]
+
+
+def _cloud(rows: np.ndarray) -> Scan:
+    if rows.ndim != 2 or rows.shape[1] not in (3, 6):
+        raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
+    rows = rows.astype(np.float64)
+    return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
+
+
+def _text(path: Path) -> Scan:
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise SdfhubError(f"{path}: not rows of numbers: {str(error).splitlines()[0]}") from error
+    return _cloud(rows)
+
+
+def _array(path: Path) -> Scan:
+    rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    if rows.dtype.kind != "f":
+        raise ValueError(f"expected floating-point numbers, got {rows.dtype}")
+    return _cloud(np.array(rows))
+
+
+def _archive(path: Path) -> Scan:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+    except zipfile.BadZipFile as error:
+        raise SdfhubError(f"{path}: cannot be read as npz; it may be cut off or damaged") from error
+    if {"pos", "neg"} <= names:
+        samples = read_samples(path)
+        return _samples(samples.points, samples.sdf, samples.center, samples.scale)
+    if "points" not in names:
+        found = ", ".join(sorted(names)) or "nothing"
+        raise SdfhubError(f"{path}: holds {found}; expected pos and neg, points and sdf, or points")
+    parts = {name: npz_array(path, name).astype(np.float64) for name in names & _PARTS}
+    if "sdf" in parts:
+        center, scale = parts.get("center", np.zeros(3)), parts.get("scale", np.ones(1))
+        return _samples(parts["points"], parts["sdf"], center, float(scale.ravel()[0]))
+    return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))
+
+
+def _samples(points: np.ndarray, sdf: np.ndarray, center: np.ndarray, scale: float) -> Scan:
+    points, sdf = points.astype(np.float64), sdf.astype(np.float64)
+    return Scan(points, sdf=sdf, center=center, scale=scale)
+
+
+_PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
+_READERS = {".ply": _ply, ".xyz": _text, ".npy": _array, ".npz": _archive}

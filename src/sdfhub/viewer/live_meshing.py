@@ -1,0 +1,98 @@
+"""Meshes of the code that was asked for last: a coarse one at once, then finer ones."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesher import Mesh, mesh_fields
+from sdfhub.model.decoder import Decoder
+from sdfhub.model.fast.computing import distances
+
+
+@dataclass(frozen=True, eq=False)
+class Meshed:
+    """A mesh of a code that was asked for.
+
+    Args:
+        about: what was handed over with the code.
+        mesh: normalised frame; empty where the field has no zero level.
+        resolution: points along an axis of its grid.
+        seconds: since it was asked for.
+    """
+
+    about: Any
+    mesh: Mesh
+    resolution: int
+    seconds: float
+
+
+class LiveMesher:
+    """A thread that meshes the latest code.
+
+    The first resolution is always finished, so that something moves while codes come faster than meshes; a
+    finer one is given up as soon as another code is asked for.
+
+    Args:
+        decoder: in evaluation mode, its weights without gradients.
+        resolutions: points along an axis of the grid, coarse to fine.
+        show: called in that thread with every mesh, or with the reason why there is none.
+    """
+
+    def __init__(
+        self, decoder: Decoder, resolutions: Sequence[int], show: Callable[[Meshed | SdfhubError], None]
+    ):
+        self.decoder, self.resolutions, self.show = decoder, tuple(resolutions), show
+        self._latest: tuple[Tensor, Any, float] | None = None
+        self._is_open = True
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="mesher", daemon=True)
+        self._thread.start()
+
+    def ask(self, code: Tensor, about: Any = None) -> None:
+        """Wants the surface of a code [L]; whatever was asked before is no longer wanted."""
+        with self._changed:
+            self._latest = (code, about, time.perf_counter())
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Ends the thread."""
+        with self._changed:
+            self._is_open = False
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._latest is not None or not self._is_open)
+                if not self._is_open:
+                    return
+                (code, about, asked), self._latest = self._latest, None
+            try:
+                self._refine(code, about, asked)
+            except _Outdated:
+                pass
+            except SdfhubError as error:
+                self.show(error)
+            except Exception as error:  # such as no memory left: the page must hear of it, and go on
+                self.show(SdfhubError(f"{type(error).__name__}: {error}"))
+
+    def _refine(self, code: Tensor, about: Any, asked: float) -> None:
+        for index, resolution in enumerate(self.resolutions):
+
+            def fields(points: Tensor, shapes: Tensor, is_first: bool = index == 0) -> Tensor:
+                if not is_first and (self._latest is not None or not self._is_open):
+                    raise _Outdated
+                return distances(self.decoder, points, code[None].expand(len(shapes), -1))
+
+            mesh = next(mesh_fields(fields, 1, resolution, device=code.device))
+            self.show(Meshed(about, mesh, resolution, time.perf_counter() - asked))
+
+
+class _Outdated(Exception):
+    """Another code was asked for."""

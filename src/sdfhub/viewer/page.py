@@ -1,0 +1,214 @@
+"""A page on which the shapes of a space can be seen, turned, moved, mixed, and fitted to a scan.
+
+What is shown is a code: between the shapes A and B, moved along the principal directions of the codes.
+"""
+
+import html
+import threading
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.space import Space
+from sdfhub.viewer.dropped_scan import FORMATS, fit_scan
+from sdfhub.viewer.live_meshing import LiveMesher, Meshed
+from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
+
+DIRECTIONS, REACH = 6, 3.0
+"""Sliders along principal directions, and how far they go, in standard deviations."""
+
+RUNGS = (64, 128)
+"""Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
+
+FAR = 0.03
+"""Mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves."""
+
+STRANGE = 2.0
+"""Times as unusual as the most unusual of the space's own codes: no shape of its kind."""
+
+MEAN = "(mean of all shapes)"
+EYE_AND_AIM = [[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]]
+"""Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
+
+CLAY, SCAN = (201, 131, 92), (42, 92, 170)
+STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
+
+
+class Viewer:
+    """The page and what it does.
+
+    Args:
+        space: whose shapes are shown.
+        title: what the space is called.
+        port: on this machine; 0 takes a free one.
+        resolution: points along an axis of the grid when nothing moves.
+
+    Attributes:
+        shapes: codes [L] by the names under which the page offers them.
+        drawn: set as soon as there is something to see.
+    """
+
+    def __init__(self, space: Space, title: str, port: int, resolution: int):
+        self.space, self.scans = space, {}
+        self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
+        self.axes = space.principal_directions[:DIRECTIONS]
+        self.drawn, self._reading, self._fitting = threading.Event(), threading.Lock(), threading.Lock()
+        self.server = LoopbackServer(port, "sdfhub", FORMATS)
+        self._furnish()
+        self._add_controls(title)
+        rungs = [*(rung for rung in RUNGS if rung < resolution), resolution]
+        self.mesher = LiveMesher(space.decoder, rungs, self._draw)
+        self.refresh()
+
+    def close(self) -> None:
+        """Ends the page and its thread."""
+        self.mesher.close()
+        self.server.stop()
+
+    def refresh(self) -> None:
+        """Asks for the surface of what the controls say."""
+        with self._reading:  # viser calls from many threads: what is asked for last was read last
+            names, share = (self.a.value, self.b.value), bounded(self.share.value, 0.0, 1.0)
+            steps = [bounded(slider.value, -REACH, REACH) for slider in self.sliders]
+            if set(names) <= self.shapes.keys():
+                a, b = (self.shapes[name] for name in names)
+                name = names[0] if share == 0 else f"{names[0]} → {names[1]}, {share:.2f}"
+                name += ", moved" * any(steps)
+                self.mesher.ask(moved(torch.lerp(a, b, share), self.axes, steps), name)
+
+    def reset(self) -> None:
+        """Back to the shape A itself."""
+        for slider in (self.share, *self.sliders):
+            slider.value = 0.0
+        self._show_scan()
+        self.refresh()
+
+    def fit(self, name: str, content: bytes) -> None:
+        """Fits a scan, offers it beside the shapes and shows it; says why where that fails."""
+        name = shown_name(name)
+        if not self._fitting.acquire(blocking=False):
+            return self._say("One scan at a time: another is being fitted.")
+        try:
+            if not content:  # what the gate cut off arrives so
+                raise SdfhubError(f"{name}: empty, larger than {MAX_UPLOAD >> 20} MiB or of another type")
+            self._say(f"Fitting {name} …")
+            code, surface = fit_scan(self.space, name, content)
+            self._say(f"{name}: {self._judged(code, surface)}")
+            self.name.content = told(name, "name") + told("meshing …", "small")
+            self.shapes[name], self.scans[name] = code, surface
+            self.a.options = self.b.options = tuple(self.shapes)
+            self.a.value = name
+            self.reset()
+        except SdfhubError as error:
+            self._say(f"{error}", is_wrong=True)
+        finally:
+            self._fitting.release()
+
+    def _judged(self, code: Tensor, surface: np.ndarray) -> str:
+        """How well a code fits the points of a scan's surface, and whether it is one of this space."""
+        with torch.no_grad():
+            off = float(self.space.sdf(surface, code).abs().mean())
+        said = f"the scan's surface is {off:.4f} off the fitted one, on average of a size of 2."
+        if off > FAR:
+            return f"{said} Doubtful: that is far."
+        if self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max():
+            return f"{said} Doubtful: its code is unlike those of this space's shapes."
+        return said
+
+    def _draw(self, found: Meshed | SdfhubError) -> None:
+        if isinstance(found, SdfhubError):
+            self.name.content = told(str(found), "wrong")
+            self.drawn.set()
+            return
+        (vertices, faces), milliseconds = found.mesh, round(1000 * found.seconds)
+        with self.server.atomic():
+            self.mesh.visible = bool(len(faces))
+            if len(faces):
+                self.mesh.vertices, self.mesh.faces = vertices, faces
+            what = f"{len(faces):,} triangles, {found.resolution}³, {milliseconds} ms"
+            self.name.content = told(found.about, "name") + told(
+                what if len(faces) else "no surface", "small"
+            )
+        self.drawn.set()
+
+    def _show_scan(self) -> None:
+        points = self.scans.get(self.a.value)
+        with self.server.atomic():
+            self.scan.visible = points is not None and self.overlay.value
+            self.overlay.visible = points is not None
+            if points is not None:
+                self.scan.points = points
+
+    def _say(self, text: str, is_wrong: bool = False) -> None:
+        self.message.content = told(text, "wrong" if is_wrong else "small")
+
+    def _furnish(self) -> None:
+        scene, up = self.server.scene, self.space.up
+        scene.set_up_direction(f"+{up}")
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.fov = *turned(EYE_AND_AIM, up), 0.66
+        plane, (below,) = {"z": "xy", "y": "xz"}[up], turned([[0, 0, -1]], up)
+        faint = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
+        scene.add_grid("/floor", 8, 8, plane=plane, position=below, **faint)
+        nothing = np.zeros((3, 3))
+        self.mesh = scene.add_mesh_simple("/shape", nothing, np.array([[0, 1, 2]]), color=CLAY, side="double")
+        self.scan = scene.add_point_cloud(
+            "/scan", nothing, SCAN, point_size=0.008, point_shape="circle", visible=False
+        )
+
+    def _add_controls(self, title: str) -> None:
+        gui, space = self.server.gui, self.space
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=CLAY)
+        size = f"{len(space.ids)} shapes, codes of {space.codes.shape[1]} numbers"
+        gui.add_html(f"<style>{STYLE}</style>" + told(title, "title") + told(size, "small"))
+        self.name = gui.add_html(told("…", "name"))
+        with gui.add_folder("Shape"):
+            self.a = gui.add_dropdown("A", tuple(self.shapes), hint="What is shown; type to search")
+            self.b = gui.add_dropdown("B", tuple(self.shapes), initial_value=tuple(self.shapes)[1])
+            self.share = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint="On the line between their codes")
+        with gui.add_folder("Principal directions"):
+            hint = "Standard deviations of the codes along this axis; 0 is the shape above"
+            axes = range(1, len(self.axes) + 1)
+            self.sliders = [gui.add_slider(f"{axis}", -REACH, REACH, 0.05, 0.0, hint=hint) for axis in axes]
+            reset = gui.add_button("Back to A", color="gray")
+        with gui.add_folder("Fit a scan"):
+            upload = gui.add_upload_button("Drop a scan here, or click", mime_type=",".join(FORMATS))
+            what = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
+            self.message = gui.add_html(told(what, "small"))
+            self.overlay = gui.add_checkbox("Show the scan's points", True, visible=False)
+        self.a.on_update(lambda _: self.reset())
+        for control in (self.b, self.share, *self.sliders):
+            control.on_update(lambda _: self.refresh())
+        reset.on_click(lambda _: self.reset())
+        self.overlay.on_update(lambda _: self._show_scan())
+        upload.on_upload(lambda _: self.fit(upload.value.name, upload.value.content))
+
+
+def moved(code: Tensor, axes: Tensor, steps: Sequence[float]) -> Tensor:
+    """A code [L] moved by steps along axes [K, L]."""
+    return code + torch.tensor(steps, dtype=code.dtype, device=code.device) @ axes
+
+
+def turned(places: Sequence[Sequence[float]], up: str) -> list[tuple[float, ...]]:
+    """Places of a world whose z points up, in one whose `up` does."""
+    return [(x, y, z) if up == "z" else (x, z, -y) for x, y, z in places]
+
+
+def bounded(value: float, low: float, high: float) -> float:
+    """What a page sent, if it is a number that its slider can have; else 0."""
+    return value if low <= value <= high else 0.0
+
+
+def shown_name(name: str) -> str:
+    """A file's name as it may be shown: no folders, nothing unprintable, not long."""
+    last = PurePath(name.replace("\\", "/")).name or "scan"
+    return "".join(letter for letter in last if letter.isprintable())[-60:]
+
+
+def told(text: str, kind: str) -> str:
+    """A paragraph of plain text for the page."""
+    return f'<p class="sdfhub-{kind}">{html.escape(text)}</p>'
