@@ -14,7 +14,7 @@ import numpy as np
 
 from sdfhub.data.store.manifest import Record, StoredFile, checked_record
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import file_sha256, whole_file, write_whole
 
 COLUMNS = {"outside": 4, "inside": 4, "surface": 6, "vertices": 3, "faces": 3}
@@ -164,7 +164,7 @@ class StoredShape:
         if "faces" not in self._files:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
-        return NormalizedMesh(vertices, faces, self.center, self.scale)
+        return NormalizedMesh(vertices, faces, Frame(self.center, self.scale))
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
