@@ -227,14 +227,9 @@ class Batch:
         b, n = self.points.shape[:2]
         m = self.surface_points.shape[1]
         _check("rows", self.rows, (b,), torch.int64)
-        shapes = {
-            "points": (b, n, 3),
-            "sdf": (b, n),
-            "surface_points": (b, m, 3),
-            "surface_normals": (b, m, 3),
-        }
-        for name, shape in shapes.items():
-            _check(name, getattr(self, name), shape, torch.float32)
+        _check("sdf", self.sdf, (b, n), torch.float32)
+        for name, count in (("points", n), ("surface_points", m), ("surface_normals", m)):
+            _check(name, getattr(self, name), (b, count, 3), torch.float32)
 
     def to(self, device, non_blocking: bool = False) -> "Batch":
         """The same batch on another device."""
