@@ -1,162 +1,150 @@
-"""The shell around every task: Hydra composes, the task runs, a user's mistake becomes one line."""
+"""The shell around every task: Hydra composes, objects are made once, a user's mistake becomes one line."""
 
+import logging
 import os
-import re
 import sys
-import uuid
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from hydra.types import RunMode
+from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from omegaconf.resolvers import oc
 
+import sdfhub
+from sdfhub.described import RESERVED, check_arguments, located
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.conf_files import composed_groups, configuration_folder, group_names, leaves, read_yaml
-from sdfhub.tasks.names import cell_name, run_name, run_stamp, search_digest, sweep_name
-from sdfhub.tasks.search import trials_done, trials_left
-from sdfhub.tasks.wording import help_of, no_such_key, one_line, told_by_plugin
+from sdfhub.multirun.names import register_resolvers
+from sdfhub.tasks.words import words_to_overrides
+
+log = logging.getLogger(__name__)
+
+Task = Callable[[DictConfig], float | None]
+"""What a command does with its composed config; a search lowers what is returned."""
 
 
-def register_resolvers() -> None:
-    """Makes the functions that configs call known to them, here or in a launcher's worker."""
-    # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
-    warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
-    for name in (run_name, run_stamp, search_digest, sweep_name, cell_name, trials_done, trials_left):
-        OmegaConf.register_new_resolver(name.__name__, name, replace=True)
-    OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
-    # two runs that start in one second must not share a folder
-    OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
+def configuration_folder() -> Path:
+    """The folder of YAMLs: inside an installed package, beside `src/` in a checkout."""
+    package = Path(sdfhub.__file__).resolve().parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parents[1] / "conf"
 
 
-def _refuse_environment(name: str, *_: str) -> None:
-    # a run's settings are written down and passed on, and the environment holds keys and passwords
-    raise SdfhubError(f"${{oc.env:{name}}}: settings are not taken from the environment; write the value")
-
-
-def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> None:
+def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> None:
     """Composes `config_name` with the command line's overrides and runs `task` on it.
 
-    What a task returns is what a search lowers.
-
-    A cell of a multirun that fails does not stop the others. Exit status: 0, 2 after a user's mistake (one
-    line on stderr, no traceback), 130 after Ctrl-C. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
-    """
-    if {"-h", "--help"} & set(sys.argv[1:]) and config_name != "config":
-        print(help_of(config_name))
-        return
-    register_resolvers()
-    guard = Guard(task, config_name)
-
-    def guarded(config: DictConfig) -> float | None:  # Hydra asks a function for its file
-        return guard(config)
-
-    conf = str(configuration_folder())
-    guard.run(hydra.main(version_base="1.3", config_path=conf, config_name=config_name)(guarded))
-    for error in guard.failures:
-        print(f"sdfhub: error: {one_line(error, config_name)}", file=sys.stderr)
-    if guard.failures:
-        sys.exit(2)
-
-
-@dataclass
-class Guard:
-    """Keeps what a user has to be told until all cells of a command are done.
+    Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C; 1 where
+    Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
 
     Args:
         task: given each composed config.
-        config_name: of the task.
+        config_name: a YAML of conf/.
+        positional: keys that words without `=` stand for, in their order; the last takes all that are left.
     """
+    sys.argv[1:] = words_to_overrides(sys.argv[1:], positional)
+    register_resolvers()
+    refused: list[str] = []
+    process, verbose = os.getpid(), os.environ.get("HYDRA_FULL_ERROR") == "1"
 
-    task: Callable[[DictConfig], float | None]
-    config_name: str
-    failures: list[Exception] = field(default_factory=list)
-    verbose: bool = field(default_factory=lambda: os.environ.get("HYDRA_FULL_ERROR") == "1")
-    process: int = field(default_factory=os.getpid)
-    composed: bool = False
-
-    def __call__(self, config: DictConfig) -> float | None:
-        self.composed = True
+    def guarded(config: DictConfig) -> float | None:
         try:
-            refuse_multirun_words(HydraConfig.get())
-            refuse_strangers(config, self.config_name, HydraConfig.get())
-            return self.task(config)
-        except (SdfhubError, OmegaConfBaseException, OSError) as error:
-            if self.verbose:
+            return task(config)
+        except (SdfhubError, OmegaConfBaseException, OSError, MemoryError) as error:
+            if verbose:
                 raise
-            if os.getpid() != self.process:  # a launcher's worker: only what is raised finds its way home
-                raise SdfhubError(one_line(error, self.config_name)) from None
-            self.failures.append(error)
+            if os.getpid() != process:  # in a launcher's worker only what is raised comes home
+                raise SdfhubError(one_line(error)) from None
+            refused.append(one_line(error))
         return None
 
-    def run(self, app: Callable[[], None]) -> None:
-        """Runs Hydra's app; raises what is no user's mistake."""
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints composition errors itself, in its own words
-        try:
-            app()
-        except BrokenPipeError:  # `--help | head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(1)
-        except KeyboardInterrupt:
-            print("sdfhub: interrupted", file=sys.stderr)
-            sys.exit(130)
-        except Exception as error:
-            error = told_by_plugin(error) or error
-            told = isinstance(error, SdfhubError | HydraException | OmegaConfBaseException | OSError)
-            if self.verbose or (self.composed and not told):  # what Hydra makes of a line may raise anything
-                raise
-            self.failures.append(error)
-        finally:
-            os.environ["HYDRA_FULL_ERROR"] = str(int(self.verbose))
+    app = hydra.main(version_base="1.3", config_path=str(configuration_folder()), config_name=config_name)
+    try:
+        app(guarded)()
+    except KeyboardInterrupt:
+        print("sdfhub: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # `--help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    for line in refused:
+        print(f"sdfhub: error: {line}", file=sys.stderr)
+    if refused:
+        sys.exit(2)
 
 
-def first_word_as(key: str) -> None:
-    """Lets the command line's first word stand for a path: `sdfhub report DIR` for `... sweep=DIR`."""
-    first = sys.argv[1] if len(sys.argv) > 1 else "-"
-    if Path(first).is_dir() or (not first.startswith("-") and "=" not in first):
-        quoted = first.replace("\\", "\\\\").replace("'", "\\'")
-        sys.argv[1] = f"{key}='{quoted}'"  # quoted, so that Hydra takes any path as text
+def one_line(error: BaseException) -> str:
+    """What a user needs of an error: what is wrong, in one line."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
+    if isinstance(error, MemoryError):
+        return f"out of memory: {error}; lower resolution, points or samples"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)) or type(error).__name__
 
 
-def refuse_multirun_words(hydra: DictConfig) -> None:
-    """Refuses a launcher or a sweeper where there is one run: Hydra would take no notice of it.
+def instantiate(config: Any, key: str, **given: Any) -> Any:
+    """The object that a node of the user's own config describes: `hydra.utils.instantiate`, checked before.
 
     Args:
-        hydra: Hydra's own part of a config.
+        config: a node with `_target_`, or a mapping or list of such; None stays None.
+        key: where it stands in the config, for messages.
+        given: arguments that come from code.
 
     Raises:
-        SdfhubError: names the word.
+        SdfhubError: no such class or argument, a value of the wrong type, or what the class says of it.
     """
-    if hydra.mode == RunMode.MULTIRUN:
+    node = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    _check(node, key, given)
+    try:
+        return hydra.utils.instantiate(node, _convert_="all", **given)
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, SdfhubError | KeyboardInterrupt):
+            raise cause from error
+        raise SdfhubError(f"{key}: {one_line(cause)}") from error
+
+
+def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:
+    if isinstance(node, list):
+        for number, item in enumerate(node):
+            _check(item, f"{key}.{number}")
+    if not isinstance(node, Mapping):
         return
-    for word in hydra.overrides.hydra:
-        if re.match(r"\+*hydra[/.](launcher|sweeper)\b", word):
-            raise SdfhubError(f"{word}: needs -m")
+    for name, value in node.items():
+        _check(value, f"{key}.{name}")
+    if "_target_" in node and "_args_" not in node:
+        arguments = {name: value for name, value in node.items() if name not in RESERVED}
+        check_arguments(located(node["_target_"], key), {**arguments, **(given or {})}, key)
 
 
-def refuse_strangers(config: DictConfig, config_name: str, hydra: DictConfig) -> None:
-    """Refuses top-level keys that nothing reads, such as `+sweep=...`, and to go without those that are read.
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A config as plain data with its interpolations resolved, but `${oc.env:NAME}` as it is written.
 
-    Args:
-        config: composed; Hydra's own part may be in it.
-        config_name: of the task.
-        hydra: Hydra's own part.
-
-    Raises:
-        SdfhubError: names the key.
+    The environment holds keys and passwords; a run's config is written down and passed on.
     """
-    read = [read_yaml(configuration_folder() / f"{name}.yaml") for name in ("config", config_name)]
-    for key in config:
-        if key not in {*group_names(), *read[0], *read[1]}:
-            raise SdfhubError(no_such_key(str(key), config_name))
-    node = {key: value for key, value in read[1].items() if key not in ("defaults", "hydra")}
-    there = {*leaves(OmegaConf.to_container(config, resolve=False)), *hydra.runtime.choices}
-    groups = [group for group, choice in composed_groups(config_name).items() if choice and " " not in group]
-    for key in (*groups, *leaves(node)):
-        if key not in there:
-            raise SdfhubError(f"{key}: is needed; do not leave it out")
+    written = lambda *words: "${oc.env:" + ",".join(map(str, words)) + "}"  # noqa: E731
+    OmegaConf.register_new_resolver("oc.env", written, replace=True)
+    try:
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    finally:
+        OmegaConf.register_new_resolver("oc.env", oc.env, replace=True)
+
+
+def with_environment(node: Any) -> Any:
+    """Plain data with `${oc.env:NAME}` replaced by this machine's environment."""
+    if isinstance(node, Mapping):
+        return {name: with_environment(value) for name, value in node.items()}
+    if isinstance(node, str) and "${oc.env:" in node:
+        return OmegaConf.to_container(OmegaConf.create([node]), resolve=True)[0]
+    return node
+
+
+def with_absolute_paths(node: Any) -> Any:
+    """Plain data in which relative paths of what is there are absolute, so that they hold from anywhere."""
+    if isinstance(node, Mapping):
+        return {name: with_absolute_paths(value) for name, value in node.items()}
+    if isinstance(node, str) and "/" in node and not Path(node).is_absolute() and Path(node).exists():
+        return str(Path(node).absolute())
+    return node

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import ShapeMetrics, summarize
 from sdfhub.geometry.render import render
 from sdfhub.whole_file import write_whole
+
+log = logging.getLogger(__name__)
 
 COLUMNS = {
     "cd": "CD x10^3",
@@ -35,7 +38,7 @@ class Judged:
     """One judged shape: who it is, how good it is and, where it is on the sheet, what it looks like.
 
     Args:
-        role: `known` or `held_out`.
+        role: `train` or `held_out`.
         shape: the truth.
         metrics: of its reconstruction.
         pictures: of the truth and of the reconstruction; words stand for a surface that is not there.
@@ -88,19 +91,13 @@ def write_scores(
     if shown := [row for row in judged if row.pictures]:
         _write_sheet(shown, out / "contact_sheet.png")
     write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
-    print(table(judged))
+    log.info(table(judged))
     if judged:
-        print(f"\nmeshes:        {out / 'meshes'}")
+        log.info("\nmeshes:        %s", out / "meshes")
     if shown:
-        print(f"contact sheet: {out / 'contact_sheet.png'}")
-    _print_places(out, trained=training is not None)
+        log.info("contact sheet: %s", out / "contact_sheet.png")
+    log.info("metrics:       %s", out / "metrics.json")
     return result
-
-
-def _print_places(out: Path, trained: bool) -> None:
-    print(f"metrics:       {out / 'metrics.json'}")
-    if trained:  # a later evaluation writes no events
-        print(f"TensorBoard:   tensorboard --logdir {out}")
 
 
 def table(judged: Sequence[Judged]) -> str:
@@ -109,7 +106,7 @@ def table(judged: Sequence[Judged]) -> str:
     lines = []
     for role in dict.fromkeys(row.role for row in judged):
         rows = [row for row in judged if row.role == role]
-        title = "known shapes" if role == "known" else "held-out shapes"
+        title = "training shapes" if role == "train" else "held-out shapes"
         lines += ["", f"{title:<{width}}" + "".join(f"{heading:>11}" for heading in COLUMNS.values())]
         lines += [f"{row.shape.id:<{width}}{_cells(row.metrics)}" for row in rows]
         whole = [row.metrics for row in rows if not row.metrics.failed]
@@ -176,8 +173,8 @@ def write_distances(
             entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}
     write_whole(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
     write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
-    print("\nthis source holds no meshes: judged by signed distances, not by surfaces")
+    log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     for line in lines:
-        print("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))
-    _print_places(out, trained=training is not None)
+        log.info("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))
+    log.info("metrics:       %s", out / "metrics.json")
     return result
