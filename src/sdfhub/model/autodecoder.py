@@ -1,6 +1,7 @@
 """The LightningModule: wires decoder, codes, loss and optimiser, and logs. No formula lives here."""
 
 import time
+from functools import partial
 
 import lightning as L
 import torch
@@ -11,8 +12,8 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import Computing
 from sdfhub.model.fast.pieces import Parts, loss_in_pieces
-from sdfhub.model.losses import SdfLoss
-from sdfhub.model.optim import Adam
+from sdfhub.model.losses import Loss
+from sdfhub.model.optimisers import Optimisation
 from sdfhub.shapes import Batch
 
 
@@ -25,7 +26,7 @@ class AutoDecoder(L.LightningModule):
         decoder: f_theta(x, z).
         codes: one row per training shape.
         loss: the objective and its weights.
-        optim: makes the optimiser and its schedule.
+        optim: makes the optimiser and its schedule; also a partial of an optimiser (`Optimisation.of`).
         steps: optimiser steps of the whole training, for the schedules. It is not asked of the trainer, whose
             answer opens the data loader before a resumed run knows where it stands.
         computing: how steps are computed; by default as the device likes it.
@@ -37,8 +38,8 @@ class AutoDecoder(L.LightningModule):
         self,
         decoder: Decoder,
         codes: CodeTable,
-        loss: SdfLoss,
-        optim: Adam,
+        loss: Loss,
+        optim: Optimisation | partial,
         steps: int,
         computing: Computing | None = None,
         seed: int = 0,
@@ -47,7 +48,8 @@ class AutoDecoder(L.LightningModule):
         self.computing = computing or Computing()
         self._value, self._value_and_gradient = decoder.forward, decoder.value_and_gradient
         self.decoder, self.codes = decoder, codes
-        self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed
+        self.optim = Optimisation.of(optim)
+        self.loss, self.steps, self.seed = loss, steps, seed
         self._step_started = time.perf_counter()
 
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:

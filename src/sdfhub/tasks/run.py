@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 import yaml
+from hydra.utils import instantiate
 
 from sdfhub.checkpoint_file import LAST, read_checkpoint
 from sdfhub.errors import SdfhubError
@@ -96,8 +97,9 @@ def build_decoder(node: Mapping[str, Any]) -> Decoder:
     """
     given = {}
     if "conditioning" in node:  # the decoder's own way is not written down
-        conditioning = build(node["conditioning"] or {}, "decoder.conditioning", within="sdfhub.model.film")
-        given["conditioning"] = conditioning.func  # the class: it has no settings
+        given["conditioning"] = build(
+            node["conditioning"] or {}, "decoder.conditioning", within="sdfhub.model.conditioning"
+        )
     for part, within in (("encoding", "sdfhub.model.encodings"), ("activation", "sdfhub.model.activations")):
         given[part] = build(node.get(part) or {}, f"decoder.{part}", within=within)
     rest = {key: value for key, value in node.items() if key not in given}
@@ -119,12 +121,10 @@ def build_autodecoder(config: dict[str, Any], rows: int, steps: int = 1) -> "Aut
     return AutoDecoder(
         decoder=decoder,
         codes=_codes(config, rows, decoder.code_size),
-        loss=build(config["loss"], "loss", within="sdfhub.model"),
-        optim=build(config["optim"], "optim", within="sdfhub.model"),
+        loss=instantiate(config["loss"]),
+        optim=instantiate(config["optim"], _convert_="all"),
         steps=steps,
-        computing=build(config["computing"], "computing", within="sdfhub.model")
-        if "computing" in config
-        else None,
+        computing=instantiate(config["computing"]) if "computing" in config else None,
         seed=config["seed"],
     )
 

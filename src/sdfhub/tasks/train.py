@@ -24,7 +24,6 @@ from sdfhub.data.loading.batches import Loading
 from sdfhub.data.loading.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.model.fast.computing import bfloat16_rate
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
 from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
@@ -52,9 +51,6 @@ know float32 and bfloat16."""
 STRATEGIES = ("auto", "ddp")
 """Beginnings of those that leave a model whole: checkpoints, and what is drawn and judged while it trains,
 need every weight."""
-
-SLOW = 0.8
-"""Share of float32's rate below which bfloat16 does not pay; no processor known to us is near it."""
 
 NO_CONCERN = (
     ".*does not have many workers.*",
@@ -109,7 +105,6 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
         up=prepared.train[0].up,
     )
     print(f"run: {run}", flush=True)
-    warn_of_slow_bfloat16(parts.trainer, config["decoder"]["width"])
     fit(model, loader, parts)
     if not parts.trainer.is_global_zero:
         return {}
@@ -132,19 +127,6 @@ def fit(model: AutoDecoder, loader: SdfDataModule, parts: Parts) -> None:
                 "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
                 "data.loader.resident=false leaves the samples on the disk"
             ) from error
-
-
-def warn_of_slow_bfloat16(trainer: Trainer, width: int) -> None:
-    """Tells of a CPU that multiplies float32 faster than the bfloat16 which it is asked for."""
-    if trainer.precision != "bf16-mixed" or trainer.strategy.root_device.type != "cpu":
-        return
-    rate = bfloat16_rate(width)
-    if rate < SLOW and trainer.is_global_zero:
-        print(
-            f"trainer.precision=bf16-mixed: this CPU multiplies bfloat16, {width} wide, {1 / rate:.1f} times "
-            "slower than float32; 32-true is faster here, and more exact",
-            file=sys.stderr,
-        )
 
 
 def judge(model: AutoDecoder, prepared: Prepared, parts: Parts, run: Path) -> dict[str, Any]:
