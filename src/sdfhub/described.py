@@ -19,6 +19,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 
+OF_PYTORCH = ("torch.nn.", "torch.optim.")
+"""Layers and optimisers of PyTorch are built from a file too: they do nothing but compute."""
+
 RESERVED = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
 """Keys of a description that are no arguments."""
 
@@ -67,10 +70,10 @@ def describe(value: Any, key: str = "") -> Any:
         return {"_target_": _path(value.func), "_partial_": True, **describe(value.keywords, key)}
     if inspect.isclass(value) or inspect.isfunction(value):
         return {"_target_": _path(value), "_partial_": True}
-    if isinstance(value, Described):
-        arguments = vars(value).get("_arguments", {})
-    elif dataclasses.is_dataclass(value):
+    if dataclasses.is_dataclass(value):
         arguments = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+    elif isinstance(value, Described):
+        arguments = vars(value).get("_arguments", {})
     else:
         what = f"{type(value).__module__}.{type(value).__qualname__}"
         raise SdfhubError(f"{key}: {what} cannot say how it was made; derive it from sdfhub's own class")
@@ -122,11 +125,12 @@ def trusted_packages(trust: str | Sequence[str] | None) -> tuple[str, ...]:
 
 def _trusted(path: Any, key: str, trust: tuple[str, ...], within: str) -> Callable:
     package = path.partition(".")[0] if isinstance(path, str) else ""
-    if package not in trust and not str(path).startswith(f"{within}."):
+    ours = (f"{within}.", *OF_PYTORCH)
+    if package not in trust and not str(path).startswith(ours):
         hint = f"; trust={package} builds it, if you know that package" if package.isidentifier() else ""
         raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}{hint}")
     target = located(path, key)
-    if package not in trust and not (inspect.isclass(target) and target.__module__.startswith(f"{within}.")):
+    if package not in trust and not (inspect.isclass(target) and target.__module__.startswith(ours)):
         raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}")
     return target
 

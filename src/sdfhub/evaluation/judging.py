@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.loading.batches import draw_rows, signed_samples
+from sdfhub.data.loading.batches import draw_rows
 from sdfhub.data.processes import stream_in_processes
-from sdfhub.data.store import StoredShape, shape_seed
+from sdfhub.data.store import StoredShape
 from sdfhub.evaluation.scoresheet import (
     Judged,
     pictured,
@@ -28,7 +28,6 @@ from sdfhub.geometry.metrics import Judge
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
-from sdfhub.scans.observed_scan import observation_of_samples
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.space import reconstruct
 

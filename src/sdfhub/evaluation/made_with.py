@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from lightning.pytorch import Trainer
 
-
 PACKAGES = ("sdfhub", "torch", "lightning", "numpy")
 
 

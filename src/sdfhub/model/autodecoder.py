@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,7 +18,7 @@ from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import Computing
 from sdfhub.model.fast.pieces import Parts, loss_in_pieces
-from sdfhub.model.losses import SdfLoss
+from sdfhub.model.losses import Loss, SdfLoss
 from sdfhub.model.optimisers import Optimisation
 from sdfhub.model.saved import built_parts, model_with_weights
 from sdfhub.shapes import Batch
@@ -35,7 +36,7 @@ class AutoDecoder(L.LightningModule):
         shapes: S, rows of the code table, >= 1; `SdfDataModule.rows` tells how many there are.
         codes: makes the table, called with `shapes` and `size`.
         loss: the objective and its weights.
-        optim: makes the optimiser and its schedule.
+        optim: makes the optimiser and its schedule; also a partial of an optimiser (`Optimisation.of`).
         computing: how steps are computed; by default as the device likes it.
         validation: scores a shape of `val_dataloader`; None validates nothing.
         seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
@@ -47,15 +48,15 @@ class AutoDecoder(L.LightningModule):
         decoder: Decoder,
         shapes: int,
         codes: Callable[..., CodeTable] = CodeTable,
-        loss: SdfLoss | None = None,
-        optim: Optimisation | None = None,
+        loss: Loss | None = None,
+        optim: Optimisation | partial | None = None,
         computing: Computing | None = None,
         validation: Callable[..., dict[str, float]] | None = None,
         seed: int = 0,
     ):
         super().__init__()
         self.decoder, self.codes = decoder, codes(shapes=shapes, size=decoder.code_size)
-        self.loss, self.optim = loss or SdfLoss(), optim or Optimisation()
+        self.loss, self.optim = loss or SdfLoss(), Optimisation.of(optim or Optimisation())
         self.computing, self.validation, self.seed = computing or Computing(), validation, seed
         parts = {"decoder": decoder, "codes": codes, "loss": self.loss, "optim": self.optim}
         parts |= {"computing": self.computing, "validation": validation}

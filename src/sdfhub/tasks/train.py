@@ -1,6 +1,5 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
-import inspect
 import logging
 import warnings
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -146,15 +146,10 @@ def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
 
 
 def make_optimisation(config: DictConfig) -> Optimisation:
-    """What `optim` describes; an optimiser of PyTorch as its `_target_` takes the place of Adam."""
-    target = located(config._target_, "optim")
-    if not (inspect.isclass(target) and issubclass(target, torch.optim.Optimizer)):
-        return instantiate(config, "optim")
-    ours = {*inspect.signature(Optimisation).parameters}
-    own = {name: value for name, value in config.items() if name in ours}
-    rest = {name: value for name, value in config.items() if name not in ours and name != "_partial_"}
-    node = own | {"_target_": "sdfhub.model.optimisers.Optimisation", "optimizer": rest | {"_partial_": True}}
-    return instantiate(OmegaConf.create(node), "optim")
+    """What `optim` describes; its `_target_` may be an optimiser of PyTorch, in the place of Adam."""
+    if issubclass(located(config._target_, "optim"), torch.optim.Optimizer):
+        return Optimisation.of(hydra.utils.instantiate(config, _convert_="all", _partial_=True))
+    return Optimisation.of(instantiate(config, "optim"))
 
 
 def make_trainer(

@@ -1,4 +1,4 @@
-"""Dropout that costs less than the layer it follows."""
+"""Dropout as a function of a seed, whichever thread draws it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,18 +24,15 @@ def drawn_from(seed: int | None) -> Iterator[None]:
         _GENERATOR.reset(token)
 
 
-def random_words(count: int) -> Tensor:
-    """[count] int64 of random bits, of PyTorch's generator or that of `drawn_from`."""
-    return torch.empty(count, dtype=torch.int64).random_(-(2**63), None, generator=_GENERATOR.get())
+def dropout_factors(hidden: Tensor, probability: float) -> Tensor:
+    """0 with this probability, rounded to 2^-16 on the CPU, else its complement's inverse; like `hidden`.
 
-
-def kept(hidden: Tensor, dropout: float) -> Tensor:
-    """Dropout's factors: 0 with probability `dropout`, rounded to 2^-16, else its inverse; like `hidden`.
-
-    On the CPU from 16 random bits a number: there PyTorch's own draw takes longer than a layer's product.
+    On the CPU a number takes 16 random bits: PyTorch's own draw takes longer there than a layer's product.
     """
     if not hidden.is_cpu or torch.compiler.is_compiling():
-        return F.dropout(torch.ones_like(hidden), dropout)
-    threshold = round(dropout * 2**16)
-    bits = random_words(-(-hidden.numel() // 4)).view(torch.int16)[: hidden.numel()].view(hidden.shape)
+        return F.dropout(torch.ones_like(hidden), probability)
+    threshold = round(probability * 2**16)
+    words = torch.empty(-(-hidden.numel() // 4), dtype=torch.int64)
+    bits = words.random_(-(2**63), None, generator=_GENERATOR.get()).view(torch.int16)
+    bits = bits[: hidden.numel()].view(hidden.shape)
     return (bits >= threshold - 2**15).to(hidden.dtype).mul_(1 / (1 - threshold / 2**16))
