@@ -3,7 +3,6 @@
 import os
 import re
 import sys
-import uuid
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,26 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sdfhub.errors import SdfhubError
+from sdfhub.multirun.names import register_resolvers
 from sdfhub.tasks.conf_files import composed_groups, configuration_folder, group_names, leaves, read_yaml
-from sdfhub.tasks.names import cell_name, run_name, run_stamp, search_digest, sweep_name
-from sdfhub.tasks.search import trials_done, trials_left
 from sdfhub.tasks.wording import help_of, no_such_key, one_line, told_by_plugin
-
-
-def register_resolvers() -> None:
-    """Makes the functions that configs call known to them, here or in a launcher's worker."""
-    # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
-    warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
-    for name in (run_name, run_stamp, search_digest, sweep_name, cell_name, trials_done, trials_left):
-        OmegaConf.register_new_resolver(name.__name__, name, replace=True)
-    OmegaConf.register_new_resolver("oc.env", _refuse_environment, replace=True)
-    # two runs that start in one second must not share a folder
-    OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
-
-
-def _refuse_environment(name: str, *_: str) -> None:
-    # a run's settings are written down and passed on, and the environment holds keys and passwords
-    raise SdfhubError(f"${{oc.env:{name}}}: settings are not taken from the environment; write the value")
 
 
 def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> None:
@@ -50,6 +32,8 @@ def run_task(task: Callable[[DictConfig], float | None], config_name: str) -> No
     if {"-h", "--help"} & set(sys.argv[1:]) and config_name != "config":
         print(help_of(config_name))
         return
+    # conf/hydra has the names that users know, which are the plugins' own; Hydra warns of that each time
+    warnings.filterwarnings("ignore", r"\s*'hydra/.*is validated against ConfigStore schema")
     register_resolvers()
     guard = Guard(task, config_name)
 

@@ -1,6 +1,5 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
-import os
 import re
 import sys
 import warnings
@@ -25,16 +24,16 @@ from sdfhub.data.loading.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import bfloat16_rate
+from sdfhub.multirun.cells import go_on, run_cell
+from sdfhub.multirun.processes import ending_together, refuse_processes_in_multirun
+from sdfhub.multirun.search import objective
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import Seed, build, check, plain
-from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
 from sdfhub.tasks.prepare import Prepared, prepare_data
-from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 from sdfhub.tasks.run import (
     begin_run,
@@ -43,8 +42,6 @@ from sdfhub.tasks.run import (
     read_weights,
     refuse_unwritable,
 )
-from sdfhub.tasks.search import objective
-from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 
 PRECISIONS = ("32-true", "32", "bf16-mixed", "bf16", "None")
 """Not all that Lightning offers: pieces of a batch are differentiated without a loss scale, and the loops
@@ -88,8 +85,7 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
     parts = build_parts(config, run)
-    if must_run_apart(parts.trainer):
-        return train_apart(run)
+    refuse_processes_in_multirun(parts.trainer)
     if parts.loading.surface_per_shape:
         refuse_missing_normals(config["data"])
     refuse_unwritable(run)
@@ -276,12 +272,13 @@ def main() -> None:
     def task(config: DictConfig) -> float | None:
         hydra = HydraConfig.get()
         if hydra.mode == RunMode.MULTIRUN:
-            return objective(run_cell(train, config, hydra))
-        refuse_second_multirun(hydra)  # or it would be told to add -m, and then this
-        for group in MULTIRUNS:
-            if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
-                raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
-        go_on(train, plain(config), Path(hydra.runtime.output_dir))
+            return objective(run_cell(train_composed, config, hydra))
+        go_on(train_composed, config, Path(hydra.runtime.output_dir))
         return None
 
     run_task(task, "config")
+
+
+def train_composed(config: DictConfig, run: Path) -> dict[str, Any]:
+    """Trains what a composed config describes into the folder `run`; returns what `metrics.json` holds."""
+    return train(plain(config), run)
