@@ -4,21 +4,50 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = (
-    *("ckpt_path", "output_root", "checkpoint.", "data.store", "data.workers", "data.loader.workers"),
-    *("data.loader.resident", "hparams_search.", "logger", "debug", "paths.", "extras", "validation."),
-    *("callbacks.mesh", "callbacks.slices", "callbacks.checkpoint", "callbacks.progress", "callbacks.lr"),
-    *("callbacks.learning_rate", "computing.points_at_once", "computing.compile", "computing.tinycudann"),
-    *("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "scale.mesh_every"),
-    *("trainer.enable_", "trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices"),
-    *("trainer.strategy", "trainer.num_nodes", "trainer.logger", "trainer.callbacks", "trainer.profiler"),
-    *(
+WHERE_NOT_WHAT = tuple(
+    [
+        "ckpt_path",
+        "output_root",
+        "checkpoint.",
+        "data.store",
+        "data.workers",
+        "data.loader.workers",
+        "data.loader.resident",
+        "data.validation",
+        "hparams_search.",
+        "logger",
+        "debug",
+        "paths.",
+        "extras",
+        "validation.",
+        "scale.mesh_every",
+        "callbacks.mesh",
+        "callbacks.slices",
+        "callbacks.checkpoint",
+        "callbacks.progress",
+        "callbacks.lr",
+        "callbacks.learning_rate",
+        "computing.points_at_once",
+        "computing.compile",
+        "computing.tinycudann",
+        "evaluate.workers",
+        "evaluate.fit_together",
+        "evaluate.pictures",
+        "trainer.enable_",
+        "trainer.log_every_n_steps",
+        "trainer.accelerator",
+        "trainer.devices",
+        "trainer.strategy",
+        "trainer.num_nodes",
+        "trainer.logger",
+        "trainer.callbacks",
+        "trainer.profiler",
+        "trainer.num_sanity",
         "trainer.default_root_dir",
         "trainer.check_val",
-        "trainer.val_",
+        "trainer.val_check",
         "trainer.limit_val",
-        "trainer.num_san",
-    ),
+    ]
 )
 """Beginnings of keys that say where a run happens and how it is watched: they change no result.
 

@@ -87,8 +87,9 @@ def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
     """A composed cell as `sweep.json` keeps it; a ValueError for a seed that is no whole number."""
     choices = choices_of(config, hydra)
-    words = (override.lstrip("+~").partition("=") for override in hydra.overrides.task)
-    settings = {key: value for key, _, value in words if key not in choices or key in UNNAMED_GROUPS}
+    words = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} stays as written
+    pairs = (word.lstrip("+~").partition("=") for word in words)
+    settings = {key: value for key, _, value in pairs if key not in choices or key in UNNAMED_GROUPS}
     return PlannedCell(
         folder=folder,
         choices={group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS},

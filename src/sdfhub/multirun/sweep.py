@@ -34,21 +34,19 @@ class SweepRecord(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         if not _trains(config):
             return
-        asked = [
-            word for word in config.hydra.overrides.task if word.startswith(("sweeps=", "hparams_search="))
-        ]
+        words = _words(config)
+        asked = [word for word in words if word.startswith(("sweeps=", "hparams_search="))]
         if len(asked) > 1 or "," in "".join(asked):  # Hydra would train the cells of none of them
-            print(f"sdfhub: error: {' '.join(asked)}: one sweep or search a command", file=sys.stderr)
-            sys.exit(2)  # what a callback raises, Hydra makes a warning of
+            _refuse(f"{' '.join(asked)}: one sweep or search a command")
         try:
             self._cells = planned_cells(config)
-        except (HydraException, OmegaConfBaseException, ValueError):
+        except (HydraException, OmegaConfBaseException):
             return  # the sweeper composes the same cells, and its error is worded for the user
-        words = [word for word in (*config.hydra.overrides.task, *config.hydra.overrides.hydra)]
-        words = [word for word in words if not word.startswith("hydra.mode=")]
-        enter_cells(
-            Path(config.hydra.sweep.dir), self._cells, shlex.join(["python", "train.py", "-m", *words])
-        )
+        except ValueError as error:
+            _refuse(str(error))
+        words += [word for word in _words(config, "hydra") if not word.startswith("hydra.mode=")]
+        command = shlex.join(["python", "train.py", "-m", *words])
+        enter_cells(Path(config.hydra.sweep.dir), self._cells, command)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         if not _trains(config):
@@ -76,11 +74,21 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
         return []
     loader = GlobalHydra.instance().config_loader()
     params = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
-    words = [f"{key}={value}" for key, value in params.items()] + list(config.hydra.overrides.task)
+    words = [f"{key}={value}" for key, value in params.items()] + _words(config)
     overrides = OverridesParser.create(config_loader=loader).parse_overrides(words)
     (jobs,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
     cells = [loader.load_sweep_config(config, job) for job in jobs]
     return [planned_cell(cell, cell.hydra, str(cell.hydra.sweep.subdir)) for cell in cells]
+
+
+def _words(config: DictConfig, part: str = "task") -> list[str]:
+    """The overrides of the command line as they were typed."""
+    return OmegaConf.to_container(config.hydra.overrides[part], resolve=False)
+
+
+def _refuse(message: str) -> None:
+    print(f"sdfhub: error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)  # what a callback raises, Hydra makes a warning of
 
 
 def _trains(config: DictConfig) -> bool:
