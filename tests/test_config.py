@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks.app import configuration_folder, instantiate, plain, with_environment
+from sdfhub.composition import configuration_folder, instantiate, plain, with_environment
 from sdfhub.tasks.train import make_parts
 from tests.tiny import composed, run_command
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, open_dict
 
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.app import configuration_folder
+from sdfhub.composition import configuration_folder
 
 ROOT = Path(__file__).parents[1]
 TINY = [

@@ -12,7 +12,7 @@ from sdfhub.described import trusted_packages
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import load
 from sdfhub.space import Space
-from sdfhub.tasks.app import configuration_folder
+from sdfhub.composition import configuration_folder
 from sdfhub.tasks.train import train as train_into
 
 

@@ -13,7 +13,8 @@ from sdfhub.described import built, check
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import evaluate_model
 from sdfhub.opening import beside, load, read_run
-from sdfhub.tasks.app import instantiate, plain, run_task, with_environment
+from sdfhub.composition import instantiate, plain, with_environment
+from sdfhub.tasks.app import run_task
 
 log = logging.getLogger(__name__)
 

@@ -27,12 +27,13 @@ from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
 from sdfhub.multirun.cells import go_on, run_cell
-from sdfhub.multirun.processes import ending_together
+from sdfhub.multirun.processes import ending_together, refuse_processes_in_multirun
 from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import instantiate, plain, run_task, with_absolute_paths
+from sdfhub.composition import instantiate, plain, with_absolute_paths
+from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
@@ -72,6 +73,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
         not the first.
     """
     parts, written = make_parts(config, folder), plain(config)
+    refuse_processes_in_multirun(parts.trainer)
     if config.ckpt_path:
         refuse_other_settings(Path(config.ckpt_path), written)
     parts.data.prepare_data()
@@ -239,9 +241,6 @@ def run(config: DictConfig) -> float | None:
         log.info(OmegaConf.to_yaml(config))
     if hydra.mode == RunMode.MULTIRUN:
         return objective(run_cell(train, config, hydra))
-    for group in ("sweeps", "hparams_search"):
-        if choice := hydra.runtime.choices.get(group):
-            raise SdfhubError(f"{group}={choice}: is many runs; add -m")
     go_on(train, config, Path(hydra.runtime.output_dir))
     return None
 
