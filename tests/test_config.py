@@ -4,6 +4,8 @@ import sys
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from sdfhub.errors import SdfhubError
@@ -26,7 +28,11 @@ CHOICES = [(group, choice) for group, choice in ALL_CHOICES if group not in (*OT
 def composed(*overrides: str, config_name: str = "config"):
     register_resolvers()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(config_name, list(overrides))
+        where = [] if any("runtime.output_dir" in word for word in overrides) else ["hydra.runtime.output_dir=here"]
+        config = compose(config_name, [*overrides, *where], return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    OmegaConf.set_struct(config, False)
+    del config["hydra"]
     return plain(config)
 
 
@@ -42,8 +48,9 @@ def test_every_choice_composes_and_builds(group, choice):
     build(config["data"]["preparation"], "data.preparation")
     build(config["data"]["loader"], "data.loader")
     build(config["trainer"], "trainer", within="lightning.pytorch")
-    for name, node in config["callbacks"].items():
-        build(node, f"callbacks.{name}")
+    if choice not in ("pruning", "wandb", "mlflow"):  # tried by test_callbacks, test_loggers
+        for node in (*config["callbacks"].values(), *config["logger"].values()):
+            instantiate(node)
     try:
         build(config["data"]["source"], "data.source")
     except SdfhubError as error:  # a source whose root is not on this machine says so

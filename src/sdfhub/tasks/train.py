@@ -11,15 +11,17 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from hydra.utils import instantiate
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor
 
-from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
-from sdfhub.callbacks.showing import LossBar, LossLines, TrainingRecord
+from sdfhub.callbacks.checkpoints import WholeFileIO
+from sdfhub.callbacks.progress import fitting_callbacks
+from sdfhub.callbacks.training_record import TrainingRecord
 from sdfhub.data.loading.batches import Loading
 from sdfhub.data.loading.datamodule import SdfDataModule
 from sdfhub.errors import SdfhubError
@@ -114,7 +116,9 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     if not parts.trainer.is_global_zero:
         return {}
     metrics = judge(model, prepared, parts, run)
-    parts.trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
+    for logger in parts.trainer.loggers:
+        logger.log_hyperparams(flat(config))
+        logger.log_metrics(final_scores(metrics), parts.trainer.global_step)
     return metrics
 
 
@@ -183,13 +187,8 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     """
     config["seed"] = check(config["seed"], Seed, "seed")
     resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
-    every = {
-        key: check(value, PositiveInt | None, f"checkpoint.{key}")
-        for key, value in config["checkpoint"].items()
-    }
-    if unknown := every.keys() - {"every_n_epochs", "snapshot_every_n_epochs"}:
-        raise SdfhubError(f"checkpoint.{min(unknown)}: no such setting")
-    callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
+    callbacks = [instantiate(node) for node in config["callbacks"].values() if node]
+    loggers = [instantiate(node) for node in config["logger"].values() if node]
     weights = read_weights(resume_from) if resume_from else None
     model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
     if weights:
@@ -197,12 +196,9 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
         put_weights(model, weights, resume_from)  # before the first shape is prepared
     training_steps(config["trainer"], 1)
     record = TrainingRecord()
-    callbacks += [record, *checkpointing(run / "checkpoints", **every)]
     bar = check(config["trainer"].get("enable_progress_bar", True), bool, "trainer.enable_progress_bar")
-    watched = bar and sys.stdout.isatty()
-    if bar:  # in a file a bar is ten thousand lines
-        callbacks.append(LossBar() if watched else LossLines())
-    trainer = build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks)
+    callbacks = fitting_callbacks([*callbacks, record], bool(loggers), bar)
+    trainer = build_trainer(config["trainer"], run, callbacks, loggers)
     model.computing.refuse_impossible(model.decoder.encoding, trainer.strategy.root_device)
     return Parts(
         evaluation=build_evaluation(config["evaluate"], config["loss"]),
@@ -236,7 +232,7 @@ def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
     return scores
 
 
-def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
+def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback], loggers: list) -> Trainer:
     """The trainer, or one line that says what it cannot do on this machine, or would do wrongly.
 
     Raises:
@@ -249,8 +245,8 @@ def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) ->
             f"trainer.strategy={node['strategy']}: use auto or ddp; every device has all weights"
         )
     check(node.get("gradient_clip_val"), NonNegativeFloat | None, "trainer.gradient_clip_val")
-    logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
-    ours = {"default_root_dir": run, "logger": logger, "callbacks": callbacks, "plugins": WholeFileIO()}
+    ours = {"default_root_dir": run, "logger": loggers, "callbacks": callbacks, "plugins": WholeFileIO()}
+    ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
     make = build(node, "trainer", within="lightning.pytorch", **ours)
     try:
         trainer = make()
