@@ -12,7 +12,7 @@ from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 
-from sdfhub.callbacks.showing import TrainingRecord
+from sdfhub.callbacks.training_record import TrainingRecord
 from sdfhub.errors import SdfhubError
 from sdfhub.report.plan import PlannedCell
 from sdfhub.report.results import Cell, read_sweep

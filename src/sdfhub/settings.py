@@ -4,12 +4,12 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
+WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers", "logger.")
 WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
 WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile", "computing.tinycudann")
 WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
 WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
-WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes", "scale.mesh_every")
+WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes", "validation.")
 """Settings that say where and how watched a cell runs; its result is the same under any of them."""
 
 

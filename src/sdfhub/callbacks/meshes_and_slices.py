@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sdfhub.callbacks.media import show_mesh, show_picture
 from sdfhub.callbacks.training_record import clock_stopped
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.store import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, sdf_slice
 from sdfhub.geometry.metrics import ShapeMetrics, judge

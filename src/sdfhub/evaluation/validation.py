@@ -1,14 +1,13 @@
 """The quick judgement of a few shapes during a training, for monitors and curves."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sdfhub.data.loading.batches import signed_samples
-from sdfhub.data.store.shards import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer, sample_surface
 from sdfhub.latent.fitting import Fit
@@ -17,18 +16,8 @@ from sdfhub.model.fast.computing import distances
 from sdfhub.shapes import NormalizedMesh, Observation
 from sdfhub.space import reconstruct
 
-
-class ValidationShape(Protocol):
-    """A shape to validate on, as the data module yields it.
-
-    Attributes:
-        row: of the shape in the code table; None for a held-out shape, whose code is fitted.
-        shape: its samples, and its mesh where the source has one.
-    """
-
-    row: int | None
-    shape: StoredShape
-
+if TYPE_CHECKING:
+    from sdfhub.data.loading.datamodule import ValidationShape  # Lightning's, which spaces do without
 
 @dataclass(frozen=True)
 class Validation:
@@ -55,7 +44,7 @@ class Validation:
         if self.resolution < 2 or self.points < 1 or self.delta <= 0:
             raise ValueError("validation: resolution must be at least 2, points at least 1, delta positive")
 
-    def __call__(self, decoder: Decoder, item: ValidationShape, codes: Tensor) -> dict[str, float]:
+    def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
         """The scores of one shape.
 
         Args:
