@@ -24,7 +24,8 @@ def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
     part = path.with_name(beside or f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)  # what a killed writer left, or a link that is not to be followed
+        with part.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

@@ -18,6 +18,7 @@ def register_resolvers() -> None:
     """Makes the functions that conf/ calls known to OmegaConf, here or in a launcher's worker."""
     for resolver in (run_name, run_stamp, sweep_name, cell_name, trials_done, trials_left):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
+    OmegaConf.register_new_resolver("eighth", lambda count: max(1, int(count or 1) // 8), replace=True)
     # Hydra hands cached values on from a multirun to its cells: `once` gives them all one folder
     OmegaConf.register_new_resolver("once", lambda value: value, use_cache=True, replace=True)
     # two runs that start in one second must not share a folder

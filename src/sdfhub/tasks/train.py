@@ -12,12 +12,13 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor
+from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from sdfhub.callbacks.checkpoints import WholeFileIO
-from sdfhub.callbacks.record import TrainingRecord
+from sdfhub.callbacks.progress import fitting_callbacks
+from sdfhub.callbacks.training_record import TrainingRecord
 from sdfhub.checkpoint_file import LAST
 from sdfhub.data.loading import SdfDataModule
 from sdfhub.described import located
@@ -168,10 +169,10 @@ def make_trainer(
         raise SdfhubError(
             f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
         )
-    if not loggers and config.get("logger") in (None, False):
-        callbacks = [callback for callback in callbacks if not isinstance(callback, LearningRateMonitor)]
+    has_logger = bool(loggers if config.get("logger") is None else config.logger)
+    callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
-    ours |= {"plugins": [WholeFileIO()]}
+    ours |= {"plugins": [WholeFileIO()], "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks)}
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     trainer = instantiate(config, "trainer", **given)
     for name in ("lightning.pytorch", "lightning.fabric"):  # through our handlers, into the run's log too

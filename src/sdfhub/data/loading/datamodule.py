@@ -44,6 +44,7 @@ class SdfDataModule(L.LightningDataModule):
         super().__init__()
         if not shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected, as listed above")
+        self.train_shapes = list(shapes)
         self.batches = StepBatches(shapes, loading)
         self.passes_per_epoch, self.workers = loading.passes_per_epoch, loading.workers
         self.resident = loading.resident
