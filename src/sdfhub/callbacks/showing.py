@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
 from torch import Tensor
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import sdf_slice
 from sdfhub.geometry.metrics import judge

@@ -14,10 +14,11 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
+from sdfhub.data.loading import SdfDataModule
 from sdfhub.data.loading.batches import draw_rows, signed_samples
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
@@ -31,7 +32,6 @@ from sdfhub.space import reconstruct
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import build, check, plain
 from sdfhub.tasks.opening import load
-from sdfhub.tasks.prepare import prepare_split
 from sdfhub.tasks.run import read_run, refuse_unwritable
 from sdfhub.tasks.scoresheet import Judged, pictured, write_distances, write_reconstruction, write_scores
 
@@ -224,18 +224,19 @@ def evaluate_run(config: dict[str, Any]) -> dict[str, Any]:
     evaluation = build_evaluation(config["evaluate"], trained["loss"])
     space = load(run)
     refuse_unwritable(out)
-    data = trained["data"] | {key: value for key, value in config["data"].items() if value is not None}
-    source = build(data["source"], "data.source", within="sdfhub.data.sources")
+    asked = {key: config["data"].get(key) for key in ("source", "store", "workers")}
+    data = trained["data"] | {key: value for key, value in asked.items() if value is not None}
+    loader: SdfDataModule = build(data, "data", within="sdfhub.data")
+    source = loader.source
     then = build(trained["data"]["source"], "data.source", within="sdfhub.data.sources")
     # under other settings (categories, count) a source of the same name offers shapes of the same ids
     seen = set(roles_then["train"]) if source.name == then.name else set()
     is_same = data["source"] == trained["data"]["source"]
     roles = choose_shapes(source, roles_then if is_same else {"train": [], "held_out": []}, seen, config)
-    print(f"shapes: {len(roles.train)} known, {len(roles.test)} held out", flush=True)
-    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    prepared = prepare_split(source, roles, preparation, data)
-    known = {roles_then["train"].index(shape.id): shape for shape in prepared.train}
-    return evaluate_model(space.decoder, space.codes, known, prepared.held_out, evaluation, out)
+    print(f"shapes: {len(roles.train)} known, {len(roles.held_out)} held out", flush=True)
+    train, held_out = loader.prepared(roles)
+    known = {roles_then["train"].index(shape.id): shape for shape in train}
+    return evaluate_model(space.decoder, space.codes, known, held_out, evaluation, out)
 
 
 def choose_shapes(
@@ -266,7 +267,7 @@ def choose_shapes(
     elif trained["train"] and count is None:
         unseen = trained["held_out"]
     elif count is not None:
-        unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).test]
+        unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).held_out]
     for id in (*known, *unseen):
         if id not in offered:
             raise SdfhubError(

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
 from sdfhub.callbacks.showing import LossBar, LossLines, TrainingRecord
-from sdfhub.data.loading.batches import Loading
-from sdfhub.data.loading.datamodule import SdfDataModule
+from sdfhub.data.loading import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import bfloat16_rate
@@ -33,7 +32,6 @@ from sdfhub.tasks.build import Seed, build, check, plain
 from sdfhub.tasks.cells import go_on, run_cell
 from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
 from sdfhub.tasks.made_with import made_with
-from sdfhub.tasks.prepare import Prepared, prepare_data
 from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 from sdfhub.tasks.run import (
@@ -72,7 +70,7 @@ class Parts:
     """What a config describes, built and so checked before the first shape is prepared."""
 
     evaluation: Evaluation
-    loading: Loading
+    loader: SdfDataModule
     trainer: Trainer
     record: TrainingRecord
     resume_from: Path | None
@@ -90,30 +88,29 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     parts = build_parts(config, run)
     if must_run_apart(parts.trainer):
         return train_apart(run)
-    if parts.loading.surface_per_shape:
-        refuse_missing_normals(config["data"])
     refuse_unwritable(run)
-    prepared = prepare_data(config["data"])
+    loader = parts.loader
+    loader.prepare_data()
+    loader.setup("fit")
     if parts.resume_from:
-        refuse_other_shapes(parts.resume_from, [shape.id for shape in prepared.train])
-    loader = SdfDataModule(prepared.train, parts.loading)
+        refuse_other_shapes(parts.resume_from, [shape.id for shape in loader.train_shapes])
     model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
     if parts.weights:
         put_weights(model, parts.weights, parts.resume_from)
     begin_run(
         run,
         config,
-        train=[shape.id for shape in prepared.train],
-        held_out=[shape.id for shape in prepared.held_out],
-        frames={shape.id: Frame(shape.center, shape.scale) for shape in prepared.train},
-        up=prepared.train[0].up,
+        train=[shape.id for shape in loader.train_shapes],
+        held_out=[shape.id for shape in loader.held_out_shapes],
+        frames={shape.id: Frame(shape.center, shape.scale) for shape in loader.train_shapes},
+        up=loader.train_shapes[0].up,
     )
     print(f"run: {run}", flush=True)
     warn_of_slow_bfloat16(parts.trainer, config["decoder"]["width"])
     fit(model, loader, parts)
     if not parts.trainer.is_global_zero:
         return {}
-    metrics = judge(model, prepared, parts, run)
+    metrics = judge(model, parts, run)
     parts.trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
     return metrics
 
@@ -147,17 +144,18 @@ def warn_of_slow_bfloat16(trainer: Trainer, width: int) -> None:
         )
 
 
-def judge(model: AutoDecoder, prepared: Prepared, parts: Parts, run: Path) -> dict[str, Any]:
+def judge(model: AutoDecoder, parts: Parts, run: Path) -> dict[str, Any]:
     """What `metrics.json` holds: the training's cost and the scores of known and unseen shapes."""
     training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
     if not parts.record.stepped:
         print(
             f"{parts.resume_from}: its training was finished (trainer.max_epochs would prolong it); judging"
         )
-    known = dict(enumerate(prepared.train))
+    known = dict(enumerate(parts.loader.train_shapes))
     model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
     codes = model.codes.table.detach()
-    return evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
+    held_out = parts.loader.held_out_shapes
+    return evaluate_model(model.decoder, codes, known, held_out, parts.evaluation, run, training)
 
 
 def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
@@ -206,23 +204,12 @@ def build_parts(config: dict[str, Any], run: Path) -> Parts:
     model.computing.refuse_impossible(model.decoder.encoding, trainer.strategy.root_device)
     return Parts(
         evaluation=build_evaluation(config["evaluate"], config["loss"]),
-        loading=build(config["data"]["loader"], "data.loader"),
+        loader=build(config["data"], "data", within="sdfhub.data"),
         trainer=trainer,
         record=record,
         resume_from=resume_from,
         weights=weights,
     )
-
-
-def refuse_missing_normals(data: dict[str, Any]) -> None:
-    """Refuses a source without surface normals, before hours go into preparing it.
-
-    Raises:
-        SdfhubError: the source's shapes carry none.
-    """
-    source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    if not source.has_normals:
-        raise SdfhubError(f"normals=on: the files of data={source.name} carry none; train with normals=off")
 
 
 def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
