@@ -22,7 +22,7 @@ from runs import ROOT, at_least, run_benchmark, train
 import sdfhub
 from sdfhub.data.loading.batches import signed_samples
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh

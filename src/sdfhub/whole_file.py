@@ -24,18 +24,18 @@ def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
     part = path.with_name(beside or f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.unlink(missing_ok=True)  # what a killed writer left, or a link that is not to be followed
-        with part.open("xb") as file:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file:  # a link that lies there is not followed
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        if error.errno:  # a write that fails does not say where
+        if error.errno:  # a write that fails does not name its file
             error.filename = str(path)
         raise
     finally:
-        with suppress(OSError):  # what went wrong before is told, not this
+        with suppress(OSError):  # the first error is the one to report
             part.unlink()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import fast_simplification
 import numpy as np
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.render import render
 from sdfhub.report.meshes import Mesh, reconstruction, true_mesh
 from sdfhub.report.results import ShapeScore

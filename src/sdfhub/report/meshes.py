@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.report.results import Cell, ShapeScore
 from sdfhub.shapes import RADIUS
 

@@ -163,7 +163,7 @@ class Gallery:
         truth = self.find_truth(row.done[0], id)
         if truth is None or not truth.rows("faces"):
             return None
-        return self._drawings.setdefault(("truth", truth.folder), Drawing(Subject(truth)))
+        return self._drawings.setdefault(("truth", truth.path), Drawing(Subject(truth)))
 
     def _truth_tile(self, row: Row, id: str, caption: str) -> Tile:
         truth = self._truth(row, id)

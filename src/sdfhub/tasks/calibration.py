@@ -13,8 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sdfhub.data.loading import SdfDataModule
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import BOUNDS, Evidence
@@ -22,7 +23,6 @@ from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.scans.scanning import surface_scan, view_scan
 from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.build import build
-from sdfhub.tasks.prepare import stored_split
 from sdfhub.whole_file import file_sha256, write_whole
 
 FILE = "calibration.json"
@@ -203,15 +203,14 @@ def unseen_shapes(
 ) -> list[StoredShape]:
     """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source."""
     data = trained["data"] | {name: value for name, value in data.items() if value is not None}
-    source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    offered = {shape.id: shape for shape in source.shapes()}
+    loader: SdfDataModule = build(data, "data", within="sdfhub.data")
+    offered = {shape.id: shape for shape in loader.source.shapes()}
     first = [offered[id] for id in roles["held_out"] if id in offered][:count]
     used = {*roles["train"], *roles["held_out"]}
     others = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
-    others = [shape for shape in others if shape.split == "test"] or others
-    more = split(others, 0, min(count - len(first), len(others)), seed=0).test
-    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    found = stored_split(source, Split([], first + more), preparation, data).held_out
+    others = [shape for shape in others if shape.split == "held_out"] or others
+    more = split(others, 0, min(count - len(first), len(others)), seed=0).held_out
+    found = list(loader.filled(Split([], first + more)))
     if len(found) < 3:
         raise SdfhubError(f"the run's data has {len(found)} unseen shapes, a calibration needs 3")
     return found

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import Store, preparation_hash
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
