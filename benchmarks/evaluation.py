@@ -27,9 +27,10 @@ from runs import ROOT, at_least, run_benchmark
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT
 from sdfhub.data.workers import stream_in_processes
-from sdfhub.geometry.metrics import Judge, Mesh, chamfer, sample_surface
+from sdfhub.geometry.metrics import Judge, chamfer
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.procedural import generate
-from sdfhub.shapes import NormalizedMesh
+from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.tasks.run import read_run
 
 FACES = 50_000

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.metrics import sample_surface
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.report.meshes import reconstruction
 from sdfhub.report.plan import PlannedCell
 from sdfhub.report.results import Cell, ShapeScore, read_scores

@@ -36,10 +36,11 @@ from runs import at_least, run_benchmark  # noqa: E402
 
 from sdfhub.data.preparation import sampling, visibility  # noqa: E402
 from sdfhub.data.preparation.settings import Preparation  # noqa: E402
-from sdfhub.data.preparation.signs import SIGN_METHODS, morton_order  # noqa: E402
+from sdfhub.data.preparation.signs import SIGN_METHODS  # noqa: E402
 from sdfhub.data.sources import OpenSource  # noqa: E402
 from sdfhub.data.workers import map_in_processes  # noqa: E402
 from sdfhub.errors import RejectedMesh, SdfhubError  # noqa: E402
+from sdfhub.geometry.morton import morton_order  # noqa: E402
 from sdfhub.procedural import generate  # noqa: E402
 from sdfhub.shapes import ShapeSamples  # noqa: E402
 from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402

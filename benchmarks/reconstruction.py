@@ -35,8 +35,9 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh
-from sdfhub.geometry.metrics import judge, point_to_surface, sample_surface
+from sdfhub.geometry.metrics import judge, point_to_surface
 from sdfhub.geometry.render import render
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.scans.scan import Scan
 from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.app import register_resolvers

@@ -19,7 +19,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import sdfhub
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.metrics import chamfer, sample_surface
+from sdfhub.geometry.metrics import chamfer
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate_run

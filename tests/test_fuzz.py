@@ -248,10 +248,7 @@ SWEEP = {
         {"training": {"seconds": 1.0, "steps": 3, "parameters": 5}, "known": {"shapes": [SCORE]}}
     ).encode(),
     "a/config.yaml": yaml.safe_dump(
-        {
-            "data": {"loader": {"shapes_per_step": 1, "samples_per_shape": 2}},
-            "trainer": {"max_epochs": 3},
-        }
+        {"data": {"loader": {"shapes_per_step": 1, "samples_per_shape": 2}}, "trainer": {"max_epochs": 3}}
     ).encode(),
     "a/split.json": SPLIT,
 }

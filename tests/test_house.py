@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "sdfhub"
 FILES = sorted(SOURCE.rglob("*.py"))
 FORBIDDEN_IMPORTS = {
-    "data": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.model", "sdfhub.geometry"),
+    "data": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.model"),
     "model": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.data", "sdfhub.geometry"),
     "geometry": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report", "sdfhub.data", "sdfhub.model"),
     "space.py": ("hydra", "omegaconf", "sdfhub.tasks", "sdfhub.report"),

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry import marching, mesher
-from sdfhub.geometry.coarse_to_fine import Judged, judge_blocks
+from sdfhub.geometry.coarse_to_fine import SampledCells, sample_blocks
 from sdfhub.geometry.grid import Grid
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
 from sdfhub.geometry.metrics import is_closed
@@ -185,18 +185,18 @@ def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
     index = (want[0][0] + 1) * 95 / 2
     seen = np.array([[0, *(index // 2).astype(int)]])
     centre = torch.from_numpy((2 * seen[:, 1:] + 1) * 2 / 95 - 1).float()
-    judged = Judged(seen, torus(centre).numpy(), np.array([np.inf]))
-    monkeypatch.setattr(mesher, "judge_blocks", lambda *_: judged)
+    sampled = SampledCells(seen, torus(centre).numpy(), np.array([np.inf]))
+    monkeypatch.setattr(mesher, "sample_blocks", lambda *_: sampled)
     assert_same_mesh(mesh_field(torus, 96), want)
 
 
 @pytest.mark.parametrize("field", [torus, Waves(0)])
-def test_signs_told_wrongly_are_found_out(field, monkeypatch):
+def test_signs_inferred_wrongly_are_corrected(field, monkeypatch):
     def too_sure(grid, coarse, safety):
-        judged = judge_blocks(grid, coarse, safety)
-        return judged._replace(slope=0.2 * judged.slope)
+        sampled = sample_blocks(grid, coarse, safety)
+        return sampled._replace(slope=0.2 * sampled.slope)
 
-    monkeypatch.setattr(mesher, "judge_blocks", too_sure)
+    monkeypatch.setattr(mesher, "sample_blocks", too_sure)
     assert_same_mesh(mesh_field(field, 96), mesh_dense(field, 96))
 
 

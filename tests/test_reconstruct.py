@@ -186,7 +186,7 @@ def test_neither_a_large_residual_nor_an_unlikely_code_passes():
 def test_of_each_shape_several_views_are_calibrated_and_one_of_any_other_scan():
     evidence = task.build(composed("run=-", "target=-", config_name="reconstruct")["evidence"], "evidence")
     box = trimesh.creation.box((0.9, 0.7, 0.5))
-    mesh = NormalizedMesh(np.array(box.vertices), np.array(box.faces), np.zeros(3), 1.0)
+    mesh = NormalizedMesh(np.array(box.vertices), np.array(box.faces))
     shapes = [SimpleNamespace(id=id, fingerprint="f", up="z", mesh=mesh) for id in ("a", "b")]
     views = Alike("view", 0, 0.0).targets(shapes, evidence)
     assert len(views) == 2 * calibrations.VIEWS == 4
@@ -196,7 +196,7 @@ def test_of_each_shape_several_views_are_calibrated_and_one_of_any_other_scan():
 
 def test_a_rod_is_looked_at_again_where_it_was_seen_from_its_end(monkeypatch):
     rod = trimesh.creation.box((0.03, 0.03, 1.9))
-    mesh = NormalizedMesh(np.array(rod.vertices), np.array(rod.faces), np.zeros(3), 1.0)
+    mesh = NormalizedMesh(np.array(rod.vertices), np.array(rod.faces))
     shape = SimpleNamespace(id="rod", fingerprint="f", up="z", mesh=mesh)
     end, side = np.array([0, 0, 2.5]), np.array([2.5, 0, 0])
     sensors = iter([end, end, side])

@@ -8,14 +8,11 @@ from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.pieces import ROOM, cut_long
 from sdfhub.data.preparation.sampling import sample_points
 from sdfhub.data.preparation.settings import Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, morton_order, nearest_points, winding_signs
-from sdfhub.data.preparation.visibility import (
-    closed_surface,
-    points_on_faces,
-    sightings,
-    view_directions,
-    visible_surface,
-)
+from sdfhub.data.preparation.signs import SIGN_METHODS, nearest_points, winding_signs
+from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface
+from sdfhub.geometry.morton import morton_order
+from sdfhub.geometry.sphere import sphere_directions
+from sdfhub.geometry.surface_sampling import points_on_faces
 from sdfhub.triangles import face_normals
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
@@ -128,7 +125,7 @@ def test_rays_from_the_faces_see_what_rays_at_the_faces_see():
     seen, rng = sightings(mesh, 100, np.random.default_rng(0)), np.random.default_rng(1)
     scene = EmbreeScene()
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-    directions, normals = view_directions(400), face_normals(mesh.vertices, mesh.faces)
+    directions, normals = sphere_directions(400), face_normals(mesh.vertices, mesh.faces)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     sums = np.zeros((2, len(mesh.faces)))
     face = np.arange(len(mesh.faces))

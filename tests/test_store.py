@@ -15,7 +15,7 @@ from sdfhub.data.store import shards, store
 from sdfhub.data.store.manifest import read_manifest, write_manifest
 from sdfhub.data.store.store import Store, prepare
 from sdfhub.errors import RejectedMesh, SdfhubError
-from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 
 SETTINGS = Preparation()
 
@@ -52,9 +52,9 @@ def ball(seed: int, rows: int = 300) -> ShapeSamples:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     corners = np.array([[0.9, 0, 0], [0, 0.9, 0], [0, 0, 0.9], [0, 0, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int64)
-    center = np.array([1.0, 2.0, 3.0])
-    mesh = NormalizedMesh(corners, faces, center, 2.0)
-    return ShapeSamples(points, sdf, 0.9 * normals, normals, center, 2.0, mesh, {"inside": 0.4})
+    frame = Frame(np.array([1.0, 2.0, 3.0]), 2.0)
+    mesh = NormalizedMesh(corners, faces, frame)
+    return ShapeSamples(points, sdf, 0.9 * normals, normals, frame, mesh, {"inside": 0.4})
 
 
 def fill(root, source, **settings) -> Store:

@@ -6,6 +6,7 @@ in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ RADIUS = 1 / 1.03
 
 _PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
 SHAPE_ID = rf"^{_PART}(/{_PART})*$"
-"""What may name a shape: safe as a path below a folder, none that leads out of it."""
+"""Pattern of a shape's id: safe as a path below a folder, and none leads out of it."""
 
 
 def check_id(id: str) -> None:
@@ -37,6 +38,18 @@ def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
         raise ValueError(f"{name}: expected {wanted}, got {list(array.shape)} {array.dtype}")
 
 
+class Mesh(NamedTuple):
+    """A triangle mesh in any frame.
+
+    Args:
+        vertices: [V, 3] float64.
+        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside; F = 0 where it is empty.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """Where a shape's normalised frame lies in its source's frame.
@@ -56,6 +69,20 @@ class Frame:
                 f"frame: center must be finite and scale positive, got {self.center}, {self.scale}"
             )
 
+    @classmethod
+    def around(cls, points: np.ndarray) -> tuple["Frame", np.ndarray]:
+        """The frame that centres the bounding box of points [N, 3], and the points in it [N, 3].
+
+        Raises:
+            ValueError: the points lie in one place, or too far apart to be measured.
+        """
+        low, high = points.min(axis=0), points.max(axis=0)
+        half, center = high / 2 - low / 2, high / 2 + low / 2  # halves first: a sum may overflow
+        size = max(half.max(), np.finfo(np.float64).tiny)
+        unit = (points - center) / size  # near 1 before squares are taken
+        factor = RADIUS / max(np.linalg.norm(unit, axis=1).max(), np.finfo(np.float64).tiny)
+        return cls(center, float(factor / size)), unit * factor
+
     def to_source(self, points: np.ndarray) -> np.ndarray:
         """Points [N, 3] of the normalised frame in the source's."""
         return points / self.scale + self.center
@@ -69,68 +96,71 @@ NORMALIZED = Frame(np.zeros(3), 1.0)
 """The frame of a shape that has no source: the normalised one itself."""
 
 
+class _InFrame:
+    """Centre and scale of what has a frame."""
+
+    @property
+    def center(self) -> np.ndarray:
+        """[3] float64, source units; `source = normalised / scale + center`."""
+        return self.frame.center
+
+    @property
+    def scale(self) -> float:
+        """Normalised units per source unit."""
+        return self.frame.scale
+
+
 @dataclass(frozen=True)
-class NormalizedMesh:
-    """A triangle mesh in the normalised frame and the way back to its source's frame.
+class NormalizedMesh(_InFrame):
+    """A triangle mesh in the normalised frame.
 
     Args:
         vertices: [V, 3] float64, all within the unit ball.
         faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside.
-        center: [3] float64, source units.
-        scale: normalised units per source unit, > 0.
+        frame: the way back to the source's frame.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    center: np.ndarray
-    scale: float
+    frame: Frame = NORMALIZED
 
     def __post_init__(self):
         _check("vertices", self.vertices, (None, 3), np.float64)
         _check("faces", self.faces, (None, 3), np.int64)
-        _check("center", self.center, (3,), np.float64)
-        if not np.isfinite(self.vertices).all() or self._reach() > 1 + 1e-6:
+        reach = np.linalg.norm(self.vertices, axis=1).max(initial=0)
+        if not reach <= 1 + 1e-6:  # false for what is not finite
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise ValueError("faces: index a vertex that is not there")
-        if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"center, scale: must be finite, scale positive: {self.center}, {self.scale}")
-
-    def _reach(self) -> float:
-        return float(np.linalg.norm(self.vertices, axis=1).max(initial=0))
 
 
 @dataclass(frozen=True)
-class ShapeSamples:
+class ShapeSamples(_InFrame):
     """Signed distances and oriented surface points of one shape, normalised frame.
 
     Args:
         points: [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little.
         sdf: [N] float32, negative inside.
-        surface_points: [M, 3] float32; M = 0 where the source carries none.
+        surface_points: [M, 3] float32; M = 0 where the source has none.
         surface_normals: [M, 3] float32, unit length, outward.
-        center: [3] float64, source units.
-        scale: normalised units per source unit; `source = normalised / scale + center`.
-        mesh: the oriented faces from which the samples were taken, or None (DeepSDF's npz carry none).
-        statistics: plain numbers about the preparation (two-sided area, inside fraction, ...).
+        frame: the way back to the source's frame.
+        mesh: the oriented faces from which the samples were taken, or None (DeepSDF's npz have none).
+        statistics: numbers about the preparation (two-sided area, inside fraction, ...).
     """
 
     points: np.ndarray
     sdf: np.ndarray
     surface_points: np.ndarray
     surface_normals: np.ndarray
-    center: np.ndarray
-    scale: float
+    frame: Frame
     mesh: NormalizedMesh | None
     statistics: dict[str, float]
 
     def __post_init__(self):
         n, m = len(self.points), len(self.surface_points)
-        _check("points", self.points, (n, 3), np.float32)
-        _check("sdf", self.sdf, (n,), np.float32)
-        _check("surface_points", self.surface_points, (m, 3), np.float32)
-        _check("surface_normals", self.surface_normals, (m, 3), np.float32)
-        for name in ("points", "sdf", "surface_points", "surface_normals"):
+        shapes = {"points": (n, 3), "sdf": (n,), "surface_points": (m, 3), "surface_normals": (m, 3)}
+        for name, shape in shapes.items():
+            _check(name, getattr(self, name), shape, np.float32)
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name}: must be finite")
         if m and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3:
@@ -139,7 +169,7 @@ class ShapeSamples:
 
 @dataclass(frozen=True)
 class Observation:
-    """What is known of the signed distances of one shape: bounds of them at some points.
+    """Bounds on the signed distances of one shape at some points.
 
     A sample of the field has equal bounds; a point on the surface has 0 and 0; a point that a ray crossed
     has 0 or more below; any point has its distance to the observed surface above. Where no side is known,

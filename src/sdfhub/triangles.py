@@ -1,4 +1,4 @@
-"""What follows from a triangle mesh's arrays alone: vertices [V, 3] and faces [F, 3], in any frame."""
+"""Normals and connected pieces of a triangle mesh: vertices [V, 3] and faces [F, 3], in any frame."""
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -11,13 +11,8 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def face_components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """[F] label of each face's connected piece: faces that share a vertex share a label."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
-    return connected_components(graph, directed=False)[1][faces[:, 0]]
-
-
 def piece_count(faces: np.ndarray, vertex_count: int) -> int:
-    """Connected pieces of a mesh; vertices without a face are none."""
-    return len(np.unique(face_components(faces, vertex_count)))
+    """Connected pieces: faces that share a vertex belong together, vertices without a face count nothing."""
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertex_count, vertex_count))
+    return len(np.unique(connected_components(graph, directed=False)[1][faces[:, 0]]))

@@ -14,8 +14,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from sdfhub.data.loading.batches import draw_rows
-from sdfhub.data.processes import stream_in_processes
-from sdfhub.data.store import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.workers import stream_in_processes
 from sdfhub.evaluation.scoresheet import (
     Judged,
     pictured,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfhub.data.store import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh

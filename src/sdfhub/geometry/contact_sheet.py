@@ -12,7 +12,7 @@ from sdfhub.whole_file import whole_file
 _INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
 
 GAP = 4
-"""White between pictures, pixels: what floats beside one shape must not look like its neighbour's."""
+"""White between pictures, pixels: a part that floats beside one shape must not look like its neighbour's."""
 
 
 def contact_sheet(
@@ -24,7 +24,7 @@ def contact_sheet(
     """Lays pictures out as a grid and writes it as one PNG, whole or not at all.
 
     Args:
-        rows: pictures [S, S, 3] uint8 of one size; a text, such as "no surface", gets a tile that says it.
+        rows: pictures [S, S, 3] uint8 of one size; a text, such as "no surface", fills a tile.
         row_labels: one text per row; [] for none.
         captions: one text per column, or one per picture, of one or two lines; [] for none.
         path: where the PNG goes; its folder is made.
@@ -38,31 +38,29 @@ def contact_sheet(
     left = int(max((font.getlength(label) for label in row_labels), default=0)) + 20 if row_labels else 6
     line = font.size * 1.35
     top = int(line * max(caption.count("\n") + 1 for caption in captions)) + 16 if captions else 6
-    again = top if len(captions) > columns else GAP  # room above the rows below the first
+    between = top if len(captions) > columns else GAP  # room for captions above the other rows
     lefts = [left + j * (size + GAP) for j in range(columns)]
-    tops = [top + i * (size + again) for i in range(len(rows))]
-    page = Image.new(
-        "RGB", (left + columns * (size + GAP) + 2, top + len(rows) * (size + again) + 2), "white"
-    )
+    tops = [top + i * (size + between) for i in range(len(rows))]
+    extent = left + columns * (size + GAP) + 2, top + len(rows) * (size + between) + 2
+    page = Image.new("RGB", extent, "white")
     draw = ImageDraw.Draw(page)
-    for i, row in enumerate(rows):
-        for j, image in enumerate(row):
-            x, y = lefts[j], tops[i]
+    for y, row in zip(tops, rows, strict=True):
+        for x, image in zip(lefts, row, strict=False):
             if isinstance(image, str):
-                _told(draw, image, x, y, size)
+                _write_tile(draw, image, x, y, size)
             else:
                 page.paste(Image.fromarray(image), (x, y))
-    for i, label in enumerate(row_labels):
-        draw.text((10, tops[i] + 0.5 * size), label, fill=_INK, font=font, anchor="lm")
+    for y, label in zip(tops, row_labels, strict=False):
+        draw.text((10, y + 0.5 * size), label, fill=_INK, font=font, anchor="lm")
     for number, caption in enumerate(captions):
         i, j = divmod(number, columns)
         for k, text in enumerate(caption.split("\n")):
-            where = lefts[j] + size / 2, tops[i] - top + 8 + (k + 0.5) * line
-            draw.text(where, _shortened(text, font, size - 8), fill=_INK, font=font, anchor="mm")
+            place = lefts[j] + size / 2, tops[i] - top + 8 + (k + 0.5) * line
+            draw.text(place, _shortened(text, font, size - 8), fill=_INK, font=font, anchor="mm")
     return write_picture(page, Path(path))
 
 
-def _told(draw: ImageDraw.ImageDraw, text: str, x: int, y: int, size: int) -> None:
+def _write_tile(draw: ImageDraw.ImageDraw, text: str, x: int, y: int, size: int) -> None:
     pad, font = size // 16, ImageFont.load_default(max(6, size // 9))
     draw.rectangle((x + pad, y + pad, x + size - pad, y + size - pad), fill=_TILE, outline=_FAINT)
     draw.text((x + size / 2, y + size / 2), text, fill=_FAINT, font=font, anchor="mm")

@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Mesh
 
 Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """Maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 to signed distances [B, N]."""
 
 TILE = 1024
-"""Points of one shape that travel together. Shapes need unequal numbers of points; cut into tiles, of which
+"""Points of one shape in a row of a call. Shapes need unequal numbers of points; cut into tiles, of which
 only the last of a shape is filled up, they share a call without a code per point."""
 
 
@@ -27,7 +28,7 @@ class Grid:
 
     Args:
         fields: of all shapes.
-        shapes: those that are looked at together; keys and arrays count them from 0.
+        shapes: the shapes that are evaluated together; keys and arrays count them from 0.
         n: nodes per axis, >= 2.
         bound: half the edge of the cube, normalised frame.
         batch: points per call of `fields`; rounded down to whole tiles, at least one.
@@ -79,9 +80,9 @@ class Grid:
         parts, shape = points.to(self.device).split(self.batch), np.array([self.shapes.start])
         return np.concatenate([self._call(part[None], shape)[0] for part in parts])
 
-    def to_frame(self, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A mesh in grid steps as float64 vertices in the normalised frame and int64 faces."""
-        return vertices.astype(np.float64) * self.step - self.bound, faces.astype(np.int64)
+    def to_frame(self, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+        """A mesh in grid steps as one in the normalised frame."""
+        return Mesh(vertices.astype(np.float64) * self.step - self.bound, faces.astype(np.int64))
 
     def _points(self, keys: np.ndarray) -> torch.Tensor:
         keys = torch.from_numpy(keys).to(self.device)

@@ -32,7 +32,7 @@ def march_cells(
     if not len(cells):
         return march(np.ones((2, 2, 2), np.float32))
     cells, nodes = _indices(cells, n), _indices(nodes, n)
-    low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is looked at
+    low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is marched
     within = np.logical_and.reduce((nodes >= low[:, None]) & (nodes <= high[:, None]))
     size, values = high - low + 1, values[within]
     strides = np.array([size[1] * size[2], size[2], 1])
@@ -41,7 +41,10 @@ def march_cells(
     parts, count = [], 0
     for start in range(0, size[0] - 1, depth):
         shape = min(depth, size[0] - 1 - start) + 1, *size[1:]
-        volume, mask = np.ones(shape, np.float32), np.zeros(shape, bool)  # a cell's mark: its upper corner
+        volume, mask = (
+            np.ones(shape, np.float32),
+            np.zeros(shape, bool),
+        )  # a cell is marked at its upper corner
         for array, at, content in ((volume, places, values), (mask, uppers, True)):
             held = (at >= start * strides[0]) & (at < (start + shape[0]) * strides[0])
             array.reshape(-1)[at[held] - start * strides[0]] = content if content is True else content[held]
@@ -57,14 +60,14 @@ def march_cells(
 
 
 def _indices(keys: np.ndarray, n: int) -> np.ndarray:
-    """Indices [3, N] of nodes by their flat ones; `np.unravel_index` is several times slower."""
+    """Indices [3, N] of flat keys; `np.unravel_index` is several times slower."""
     columns = keys // n
     i = columns // n
     return np.stack([i, columns - i * n, keys - columns * n])
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
-    """One vertex where two slabs hold the same: made from the same values, it is equal bit by bit."""
+    """Merges the vertices that two slabs share: made from the same values, they are equal bit by bit."""
     seam = np.flatnonzero(vertices[:, 0] % period == 0)
     _, first, place = np.unique(vertices[seam], axis=0, return_index=True, return_inverse=True)
     target = np.arange(len(vertices))

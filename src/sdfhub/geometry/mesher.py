@@ -8,18 +8,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from sdfhub.geometry.coarse_to_fine import evaluate_crossed, judge_blocks
+from sdfhub.geometry.coarse_to_fine import evaluate_crossed_cells, sample_blocks
 from sdfhub.geometry.grid import Fields, Grid
 from sdfhub.geometry.marching import march, march_cells
+from sdfhub.shapes import Mesh
 
 Field = Callable[[torch.Tensor], torch.Tensor]
 """Maps points [N, 3] float32, normalised frame, to signed distances [N], negative inside."""
 
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Vertices [V, 3] float64, normalised frame, and faces [F, 3] int64, counter-clockwise seen from outside."""
-
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape
-_CACHED, _LARGE = 2**13, 2**20  # points per call: what a core's cache keeps, for each; what fills a GPU
+_CACHED, _LARGE = 2**13, 2**20  # points per call: what the cache of one core keeps; what fills a GPU
 
 
 def mesh_fields(
@@ -34,12 +32,12 @@ def mesh_fields(
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
 
-    Each equals `mesh_dense` except for connected pieces of surface that lie wholly in cells judged empty.
-    Where the surface leaves the cube the mesh is open. Memory is bounded by groups of shapes.
+    A mesh equals that of `mesh_dense` but for connected pieces of surface that lie wholly in skipped cells.
+    Where the surface leaves the cube the mesh is open. Shapes are meshed in groups, which bounds the memory.
 
     Args:
-        fields: maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 (0 ... shapes - 1, each
-            as often as it likes) to signed distances [B, N], negative inside.
+        fields: maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 (0 ... shapes - 1,
+            repeated in any way) to signed distances [B, N], negative inside.
         shapes: how many.
         resolution: grid nodes per axis, >= 2.
         bound: half the edge of the cube, normalised frame.
@@ -58,11 +56,11 @@ def mesh_fields(
     for first in range(0, shapes, together):
         group = range(first, min(first + together, shapes))
         grid = _grid(fields, group, resolution, bound, batch, device)
-        cells, keys, values = evaluate_crossed(grid, judge_blocks(grid, coarse, safety))
+        cells, keys, values = evaluate_crossed_cells(grid, sample_blocks(grid, coarse, safety))
         of_cell, of_key = cells // resolution**3, keys // resolution**3
         for shape in range(len(group)):
-            own, held, first = cells[of_cell == shape], of_key == shape, shape * resolution**3
-            yield grid.to_frame(*march_cells(own - first, keys[held] - first, values[held], resolution))
+            own, held, offset = cells[of_cell == shape], of_key == shape, shape * resolution**3
+            yield grid.to_frame(*march_cells(own - offset, keys[held] - offset, values[held], resolution))
 
 
 def mesh_field(
@@ -76,10 +74,10 @@ def mesh_field(
 ) -> Mesh:
     """The zero level of one field, evaluated coarse to fine: `mesh_fields` of one shape.
 
-    Args, Returns, Raises: as there, with a field of points [N, 3] alone.
+    Args, Raises: as there, with a field that takes points [N, 3] alone.
     """
     device = device or _device_of(field)
-    return next(mesh_fields(_alone(field), 1, resolution, bound, coarse, batch, safety, device))
+    return next(mesh_fields(_as_fields(field), 1, resolution, bound, coarse, batch, safety, device))
 
 
 def mesh_dense(
@@ -91,9 +89,9 @@ def mesh_dense(
 ) -> Mesh:
     """The zero level of one field, every node of the grid evaluated: the plain twin.
 
-    Args, Returns, Raises: as for `mesh_field`.
+    Args, Raises: as for `mesh_field`.
     """
-    grid = _grid(_alone(field), range(1), resolution, bound, batch, device or _device_of(field))
+    grid = _grid(_as_fields(field), range(1), resolution, bound, batch, device or _device_of(field))
     nodes = resolution**3
     keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
     values = np.concatenate([grid.evaluate(part) for part in keys])
@@ -121,7 +119,7 @@ def sdf_slice(
     Returns:
         [R, R] float32, one index for each of the two axes left, in their order, both ascending.
     """
-    grid = _grid(_alone(field), range(1), resolution, bound, batch, device or _device_of(field))
+    grid = _grid(_as_fields(field), range(1), resolution, bound, batch, device or _device_of(field))
     plane = torch.cartesian_prod(grid.axis, grid.axis)
     at = torch.full_like(plane[:, :1], offset)
     points = torch.cat([plane[:, :axis], at, plane[:, axis:]], dim=1)
@@ -141,7 +139,7 @@ def _grid(
     return Grid(fields, shapes, resolution, bound, batch, device)
 
 
-def _alone(field: Field) -> Fields:
+def _as_fields(field: Field) -> Fields:
     """A field of one shape as fields of a single one."""
 
     def fields(points: torch.Tensor, shapes: torch.Tensor) -> torch.Tensor:

@@ -4,11 +4,13 @@ Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +
 are linear RGB in [0, 1] until the last step, which maps them to sRGB bytes.
 """
 
-from typing import Literal
-
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+
+from sdfhub.geometry.sphere import sphere_directions
+from sdfhub.geometry.up_axis import UpAxis, turned_up
+from sdfhub.triangles import face_normals
 
 CLAY = (0.30, 0.46, 0.72)
 """Default surface colour, linear RGB."""
@@ -24,7 +26,7 @@ def render(
     faces: np.ndarray,
     size: int = 256,
     *,
-    up: Literal["y", "z"] = "z",
+    up: UpAxis = "z",
     azimuth: float = -55.0,
     elevation: float = 24.0,
     colour: tuple[float, float, float] = CLAY,
@@ -52,9 +54,7 @@ def render(
     image = np.full((2 * size * 2 * size, 3), background**2.2)
     faces = np.asarray(faces)
     if len(faces):
-        vertices = np.asarray(vertices, dtype=np.float64)
-        if up == "y":
-            vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
+        vertices = turned_up(np.asarray(vertices, dtype=np.float64), up, "z")
         scene = EmbreeScene()
         TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
         origins, directions = _camera_rays(2 * size, azimuth, elevation)
@@ -62,7 +62,9 @@ def render(
         seen = np.flatnonzero(hits["primID"] >= 0)
         points = origins[seen] + hits["tfar"][seen, None] * directions[seen]
         normals, flat = _normals(vertices, faces, hits, seen, directions[seen])
-        light = _light(scene, points, normals, flat, _subpixel(seen, 2 * size), occlusion_rays)
+        row, column = np.divmod(seen, 2 * size)
+        subpixel = 2 * (row % 2) + column % 2  # which of its pixel's four samples a ray is
+        light = _light(scene, points, normals, flat, subpixel, occlusion_rays)
         image[seen] = np.asarray(colour) * light
     image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
@@ -111,17 +113,9 @@ def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndar
     return origins.astype(np.float32), directions.astype(np.float32)
 
 
-def _subpixel(samples: np.ndarray, width: int) -> np.ndarray:
-    """Which of its pixel's four samples each one is."""
-    row, column = np.divmod(samples, width)
-    return 2 * (row % 2) + column % 2
-
-
 def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed and flat unit normals at the hits, both turned towards the camera."""
-    cross = np.cross(
-        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-    )
+    cross = face_normals(vertices, faces)
     of_face = _unit(cross)
     face = hits["primID"][seen]
     flat = of_face[face]
@@ -155,22 +149,22 @@ def _corner_normals(faces: np.ndarray, cross: np.ndarray, of_face: np.ndarray) -
     own = order // 3
     for k in range(valence.max()):
         rows = np.flatnonzero(count > k)
-        other = own[start[rows] + k]
-        near = np.einsum("ij,ij->i", of_face[own[rows]], of_face[other]) > _CREASE
-        total[rows[near]] += cross[other[near]]
+        neighbour = own[start[rows] + k]
+        near = np.einsum("ij,ij->i", of_face[own[rows]], of_face[neighbour]) > _CREASE
+        total[rows[near]] += cross[neighbour[near]]
     corners = np.empty_like(total)
     corners[order] = _unit(total)
     return corners.reshape(-1, 3, 3)
 
 
 def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
-    """[N, 3] light that reaches each point: a soft key, a fill and a sky dome, each with its shadows.
+    """[N, 3] light at the points: a soft key and a sky dome, both with shadows, and a fill.
 
-    The four samples of a pixel look at four interleaved sets of lights, so their mean sees all of them and
-    shadows are soft without noise.
+    The four samples of a pixel are lit by four interleaved sets of lights: their mean has soft shadows
+    without noise.
     """
     start = (points + 2e-3 * flat).astype(np.float32)
-    around = _unit(_unit(_KEY) + 0.09 * _sphere(12))  # the key is an area light
+    around = _unit(_unit(_KEY) + 0.09 * sphere_directions(12))  # the key is an area light
     key = sum(_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)) / 3
     fill = np.clip(normals @ _unit(_FILL), 0, None)
     sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
@@ -180,10 +174,8 @@ def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
 
 def _sky(scene: EmbreeScene, origins, normals, subpixel, rays: int) -> np.ndarray:
     """[N] light from a dome of 4 * rays directions; about 1 for an open level plane."""
-    dome = _sphere(4 * rays)
-    strength = np.where(
-        dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3
-    )  # a pale floor throws some light back
+    dome = sphere_directions(4 * rays)
+    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
     total = np.zeros(len(origins))
     for k in range(rays):
         chosen = 4 * k + subpixel
@@ -192,21 +184,12 @@ def _sky(scene: EmbreeScene, origins, normals, subpixel, rays: int) -> np.ndarra
 
 
 def _lit(scene: EmbreeScene, origins: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
-    """Cosine towards each point's own light, 0 where it is blocked."""
+    """[N] cosine between the normal and the direction of the point's light, 0 where it is blocked."""
     cosine = np.clip(np.einsum("ij,ij->i", normals, lights), 0, None)
     facing = np.flatnonzero(cosine > 0)
     hit = scene.run(origins[facing], lights[facing].astype(np.float32), query="OCCLUDED") >= 0
     cosine[facing[hit]] = 0
     return cosine
-
-
-def _sphere(count: int) -> np.ndarray:
-    """[count, 3] unit vectors spread evenly (Fibonacci lattice), neighbours far apart in order."""
-    k = np.arange(count)
-    z = 1 - (2 * k + 1) / count
-    turn = k * np.pi * (3 - np.sqrt(5))
-    flat = np.sqrt(1 - z * z)
-    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from manifold3d import Manifold
 from sdfhub.errors import SdfhubError
 from sdfhub.procedural import chairs, lamps, planes, sofas, tables
 from sdfhub.procedural.parameters import draw
+from sdfhub.shapes import Mesh
 
 VERSION = 3
 """Raised whenever a generator changes what it makes; stores hash it."""
@@ -39,7 +40,7 @@ def design(category: str, index: int):
     return draw(kind, np.random.default_rng([code, index]))
 
 
-def generate(category: str, index: int) -> tuple[np.ndarray, np.ndarray]:
+def generate(category: str, index: int) -> Mesh:
     """The mesh of shape `index` of a category: closed, oriented outwards, one shell.
 
     Args:
@@ -47,15 +48,14 @@ def generate(category: str, index: int) -> tuple[np.ndarray, np.ndarray]:
         index: >= 0; the same index always gives the same shape.
 
     Returns:
-        vertices: [V, 3] float64, metres, +z up, front towards -y.
-        faces: [F, 3] int64, counter-clockwise seen from outside.
+        A mesh in metres, +z up, its front towards -y.
 
     Raises:
         SdfhubError: for an unknown category or a negative index.
     """
     mesh = _outer_shell(design(category, index).build()).to_mesh64()
     vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
-    return vertices, np.array(mesh.tri_verts, dtype=np.int64)
+    return Mesh(vertices, np.array(mesh.tri_verts, dtype=np.int64))
 
 
 def _outer_shell(solid: Manifold) -> Manifold:

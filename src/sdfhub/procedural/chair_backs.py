@@ -10,14 +10,7 @@ _RAIL = 0.022  # thickness of rails and posts of light backs
 
 def back(chair) -> list[Manifold]:
     """The parts of the chair's backrest, rooted in its seat."""
-    styles = {
-        "slats": _slats,
-        "spindles": _spindles,
-        "ladder": _ladder,
-        "solid": _solid,
-        "hoop": _hoop,
-        "panel": _panel,
-    }
+    styles = dict(slats=_slats, spindles=_spindles, ladder=_ladder, solid=_solid, hoop=_hoop, panel=_panel)
     return styles[chair.back](chair)
 
 
@@ -47,6 +40,11 @@ def side_at(chair, height: float) -> float:
     return float((1 - (height / chair.back_height) ** 2.6) ** (1 / 2.6))
 
 
+def _inner_sides(chair) -> np.ndarray:
+    """Where slats and rods stand between the posts, as the `side` of `point`."""
+    return np.linspace(-1, 1, chair.slats + 2)[1:-1]
+
+
 def _upright(chair, side: float, top: float, section: np.ndarray) -> Manifold:
     heights = np.linspace(-0.5 * chair.seat_thickness, top, 7)
     path = np.array([point(chair, side, h) for h in heights])
@@ -72,7 +70,7 @@ def _slats(chair) -> list[Manifold]:
     low, high = 0.16 * chair.back_height, chair.back_height - 0.03
     made = [*_posts(chair), _rail(chair, low, 0.035, _RAIL), _rail(chair, high, 0.06, _RAIL + 0.006)]
     width = min(0.05, 0.9 * chair.seat_width / (chair.slats + 1) * 0.6)
-    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
+    for side in _inner_sides(chair):
         path = np.array([point(chair, side, h) for h in np.linspace(low, high, 5)])
         made.append(parts.sweep(path, parts.rounded_rectangle(width, 0.014, 0.004), up=(0, 1, 0)))
     return made
@@ -82,9 +80,8 @@ def _spindles(chair) -> list[Manifold]:
     """Turned rods from the seat into a crest rail."""
     high = chair.back_height - 0.02
     made = [*_posts(chair), _rail(chair, high, 0.075, _RAIL + 0.004, crest=0.025)]
-    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
-        made.append(_upright(chair, side, high, chair.spindle_width / 2 * parts.circle(10)))
-    return made
+    rod = chair.spindle_width / 2 * parts.circle(10)
+    return made + [_upright(chair, side, high, rod) for side in _inner_sides(chair)]
 
 
 def _ladder(chair) -> list[Manifold]:
@@ -100,12 +97,9 @@ def _shell(chair, low: float, thick: float, round_top: float) -> Manifold:
     sections = []
     for side in np.linspace(-1.04, 1.04, 17):
         top = chair.back_height - round_top * np.abs(side / 1.04) ** 6
-        ring = []
-        for h in np.linspace(low, top, 6):
-            ring.append(point(chair, side, h) - [0, thick / 2, 0])
-        for h in np.linspace(top, low, 6):
-            ring.append(point(chair, side, h) + [0, thick / 2, 0])
-        sections.append(ring)
+        front = [point(chair, side, h) - [0, thick / 2, 0] for h in np.linspace(low, top, 6)]
+        rear = [point(chair, side, h) + [0, thick / 2, 0] for h in np.linspace(top, low, 6)]
+        sections.append(front + rear)
     return parts.loft(np.array(sections))
 
 
@@ -129,7 +123,8 @@ def _hoop(chair) -> list[Manifold]:
     root = np.array([0, 0, -0.5 * chair.seat_thickness])
     path = np.array([path[0] + root, *path, path[-1] + root])
     made = [parts.tube(path, max(0.42 * chair.leg_width, 0.0125), 12, up=(0, 1, 0))]
-    for side in np.linspace(-1, 1, chair.slats + 2)[1:-1]:
+    rod = chair.spindle_width / 2 * parts.circle(10)
+    for side in _inner_sides(chair):
         top = chair.back_height * (1 - abs(side) ** 2.6) ** (1 / 2.6)
-        made.append(_upright(chair, side, top, chair.spindle_width / 2 * parts.circle(10)))
+        made.append(_upright(chair, side, top, rod))
     return made

@@ -66,9 +66,8 @@ class Chair:
     def _base(self) -> list[Manifold]:
         if self.legs in _FOUR_LEGS:
             return self._four_legs()
-        return {"sled": self._sled, "cantilever": self._cantilever, "star": self._star, "tulip": self._tulip}[
-            self.legs
-        ]()
+        bases = dict(sled=self._sled, cantilever=self._cantilever, star=self._star, tulip=self._tulip)
+        return bases[self.legs]()
 
     def _leg_ends(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(top, foot) of the four legs: front left, front right, back left, back right."""
@@ -86,7 +85,8 @@ class Chair:
         ends = self._leg_ends()
         made = [self._leg(top, foot) for top, foot in ends]
         if self.apron and self.legs != "round":
-            made += self._apron([top for top, _ in ends])
+            z = self.seat_height - self.seat_thickness - 0.045 / 2 + 0.008
+            made += parts.aprons([top for top, _ in ends], z, 0.018, 0.045 + 0.016)
         return made + self._stretchers(ends)
 
     def _leg(self, top: np.ndarray, foot: np.ndarray) -> Manifold:
@@ -96,54 +96,18 @@ class Chair:
         if self.legs == "round":
             return parts.bar(foot, top, 0.5 * w * self.leg_taper, 0.55 * w)
         r, t = 0.56 * w, self.leg_taper
-        profile = [
-            (0.6, 0),
-            (0.75, 0.03),
-            (0.6, 0.07),
-            (0.5, 0.1),
-            (0.62 + 0.2 * t, 0.3),
-            (0.95, 0.5),
-            (0.95, 0.56),
-        ]
-        profile += [
-            (0.55, 0.6),
-            (0.9, 0.63),
-            (0.9, 0.65),
-            (0.55, 0.68),
-            (0.95, 0.72),
-            (1.0, 0.76),
-            (1.0, 1.0),
-        ]
-        return parts.turned(foot, top, [(r * a, h) for a, h in profile])
-
-    def _apron(self, tops: list[np.ndarray]) -> list[Manifold]:
-        height = 0.045
-        made = []
-        for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)):
-            start, end = tops[a].copy(), tops[b].copy()
-            start[2] = end[2] = self.seat_height - self.seat_thickness - height / 2 + 0.008
-            made.append(parts.plank(start, end, 0.018, height + 0.016))
-        return made
+        profile = [(0.6, 0), (0.75, 0.03), (0.6, 0.07), (0.5, 0.1), (0.62 + 0.2 * t, 0.3), (0.95, 0.5)]
+        profile += [(0.95, 0.56), (0.55, 0.6), (0.9, 0.63), (0.9, 0.65), (0.55, 0.68), (0.95, 0.72)]
+        return parts.turned(foot, top, parts.scaled([*profile, (1.0, 0.76), (1.0, 1.0)], r))
 
     def _stretchers(self, ends: list[tuple[np.ndarray, np.ndarray]]) -> list[Manifold]:
-        def at(leg: int, share: float) -> np.ndarray:
-            top, foot = ends[leg]
-            return foot + share * (top - foot)
-
-        def rod(start, end) -> Manifold:
-            if self.legs == "square":
-                return parts.plank(start, end, 0.018, 0.026)
-            return parts.turned(start, end, [(0.009, 0), (0.013, 0.5), (0.009, 1)])
-
-        h = self.stretcher_height
         if self.stretchers == "none":
             return []
-        made = [rod(at(0, h), at(2, h)), rod(at(1, h), at(3, h))]
-        if self.stretchers == "h":
-            made.append(rod((at(0, h) + at(2, h)) / 2, (at(1, h) + at(3, h)) / 2))
-        if self.stretchers == "box":
-            made += [rod(at(0, h), at(1, h)), rod(at(2, h), at(3, h))]
-        return made
+        joints = [foot + self.stretcher_height * (top - foot) for top, foot in ends]
+        pairs = parts.stretchers(joints, self.stretchers)
+        if self.legs == "square":
+            return [parts.plank(a, b, 0.018, 0.026) for a, b in pairs]
+        return [parts.turned(a, b, [(0.009, 0), (0.013, 0.5), (0.009, 1)]) for a, b in pairs]
 
     def _sled(self) -> list[Manifold]:
         """Two closed loops of tube, one a side, joined by bars under the seat."""
@@ -151,12 +115,8 @@ class Chair:
         reach = 0.30 if self.seat == "round" else 0.44
         made = []
         for side in (-1, 1):
-            top = np.array(
-                [
-                    (side * (self.half_width(y) - 1.5 * r), y, z)
-                    for y in self.seat_depth * reach * np.array([-1, 1])
-                ]
-            )
+            ys = self.seat_depth * reach * np.array([-1, 1])
+            top = np.array([(side * (self.half_width(y) - 1.5 * r), y, z) for y in ys])
             out = np.array([side * 0.4 * self.leg_splay, 0, 0])
             floor = top + out + np.array([[0, -0.5 * self.leg_splay - 0.01, r - z], [0, 0.06, r - z]])
             path = parts.filleted([top[0], floor[0], floor[1], top[1]], 0.05)
@@ -180,8 +140,8 @@ class Chair:
         made = [parts.lathe([(0.026, 0.075), (0.026, 0.62 * z), (0.017, 0.62 * z + 0.01), (0.017, z)])]
         made.append(parts.lathe([(0.038, 0.07), (0.042, 0.1), (0.026, 0.14)]))
         made.append(parts.lathe([(0.03, z - 0.06), (0.11, z - 0.02), (0.11, z)]))
-        for angle in 2 * np.pi * np.arange(5) / 5 - np.pi / 2:
-            tip = reach * np.array([np.cos(angle), np.sin(angle), 0]) + np.array([0, 0, 0.062])
+        for out in parts.spokes(5):
+            tip = reach * out + np.array([0, 0, 0.062])
             made.append(parts.bar((0, 0, 0.1), tip, 0.62 * self.leg_width, 0.42 * self.leg_width))
             made.append(parts.ellipsoid((0.03, 0.03, 0.03), tip - np.array([0, 0, 0.032]), 16))
             made.append(parts.ellipsoid((0.018, 0.018, 0.02), tip, 12))
@@ -206,8 +166,7 @@ class Chair:
         wide = max(x, behind[0]) + 0.02
         if self.arms == "curved":
             corners = [behind, (wide, 0.3 * y, z + 0.01), (wide, y - 0.05, z - 0.01), seat]
-            return parts.mirrored(
-                parts.tube(parts.filleted(corners, 0.06, 5), 0.4 * self.leg_width, up=(1, 0, 0.2))
-            )
+            path = parts.filleted(corners, 0.06, 5)
+            return parts.mirrored(parts.tube(path, 0.4 * self.leg_width, up=(1, 0, 0.2)))
         rest = parts.plank(behind + [0, 0.01, 0], (x, y - 0.05, z), 0.045, 0.024)
         return [*parts.mirrored(rest), *parts.mirrored(parts.square_bar(seat, (x, y, z), 0.03))]

@@ -5,7 +5,7 @@ from manifold3d import Manifold
 
 from sdfhub.procedural import parts
 
-_THIRDS = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
+_THIRDS = parts.spokes(3, 0.5)
 
 
 def height(lamp) -> float:
@@ -22,10 +22,8 @@ def head(lamp, hung: bool) -> Manifold:
         hung: held from above by a rod that ends above the shade; else from below by one that ends under it.
     """
     tall, gauge = height(lamp), lamp.gauge()
-    closed = {"dome": _dome, "globe": _globe, "bowl": _bowl}
-    if lamp.shade in closed:
-        return parts.union(closed[lamp.shade](lamp, tall, gauge, hung))
-    return parts.union(_open(lamp, tall, gauge, hung))
+    build = {"dome": _dome, "globe": _globe, "bowl": _bowl}.get(lamp.shade, _open)
+    return parts.union(build(lamp, tall, gauge, hung))
 
 
 def _rod(bottom: float, top: float, radius: float) -> Manifold:
@@ -56,11 +54,10 @@ def _pleated(lamp, tall: float) -> Manifold:
     ring = parts.circle(2 * lamp.pleats) * fold
 
     def solid(offset: float, overshoot: float) -> Manifold:
-        shares = np.array([-overshoot, 1 + overshoot])
-        rings = [
-            np.column_stack([(r + offset) * ring, np.full(len(ring), s * tall)])
-            for s, r in zip(shares, _radius(lamp, shares), strict=True)
-        ]
+        rings = []
+        for share in np.array([-overshoot, 1 + overshoot]):
+            radius = _radius(lamp, share) + offset
+            rings.append(np.column_stack([radius * ring, np.full(len(ring), share * tall)]))
         return parts.loft(np.array(rings))
 
     wall = lamp.wall_thickness()
@@ -89,19 +86,17 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     if lamp.fitting == "rings":
         made += _spider(lamp, tall, 0.08, gauge)
     if lamp.finial:
-        top = at * tall
-        made += [
-            _rod(top - gauge, top + 3 * gauge, 0.9 * gauge),
-            parts.ellipsoid((1.9 * gauge, 1.9 * gauge, 2.3 * gauge), (0, 0, max(top + 4 * gauge, tall)), 16),
-            _rod(top, max(top + 4 * gauge, tall), 0.9 * gauge),
-        ]
+        top, knob = at * tall, max(at * tall + 4 * gauge, tall)
+        made.append(_rod(top - gauge, top + 3 * gauge, 0.9 * gauge))
+        made.append(parts.ellipsoid((1.9 * gauge, 1.9 * gauge, 2.3 * gauge), (0, 0, knob), 16))
+        made.append(_rod(top, knob, 0.9 * gauge))
     return made
 
 
 def _spider(lamp, tall: float, share: float, gauge: float) -> list[Manifold]:
     reach, z = float(_radius(lamp, np.array(share))), share * tall
     reach *= 1 - (0.9 / lamp.pleats if lamp.shade == "pleated" else 0.0)
-    wires = [parts.bar((0, 0, z), (reach * np.cos(a), reach * np.sin(a), z), 0.8 * gauge) for a in _THIRDS]
+    wires = [parts.bar((0, 0, z), reach * out + [0, 0, z], 0.8 * gauge) for out in _THIRDS]
     return [*wires, _rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]
 
 
@@ -121,10 +116,8 @@ def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     radius = 0.7 * cap + (wide - 0.7 * cap) * np.cos(angle) ** power
     profile = np.column_stack([radius, tall * np.sin(angle)])
     size = min(0.36 * wide, 0.3 * tall)
-    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
-    made.append(
-        parts.lathe([(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)])
-    )
+    crown = [(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)]
+    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40), parts.lathe(crown)]
     if hung:
         made += [*_bulb(0.42 * tall, size, gauge, False), _rod(0.42 * tall, tall + 4 * gauge, gauge)]
     else:
@@ -160,9 +153,8 @@ def _bowl(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     if not hung:
         return [*made, _rod(-4 * gauge, 0, gauge)]
     apex = tall + 1.1 * wide
-    for a in _THIRDS:
-        rim = np.array([0.97 * wide * np.cos(a), 0.97 * wide * np.sin(a), 0.97 * tall])
-        made.append(parts.bar(rim, (0, 0, apex), 0.8 * gauge))
+    for out in _THIRDS:
+        made.append(parts.bar(0.97 * wide * out + [0, 0, 0.97 * tall], (0, 0, apex), 0.8 * gauge))
     return [*made, parts.ellipsoid((2 * gauge,) * 3, (0, 0, apex), 16), _rod(apex, apex + 3 * gauge, gauge)]
 
 

@@ -31,9 +31,7 @@ class Lamp:
     reach: float = continuous(0.45, 0.75)
     elbow: float = continuous(0.4, 0.62)
     tilt: float = continuous(0.0, 40.0)
-    kind: str = choice(
-        "floor", "table", "table", "table", "desk", "desk", "arc", "tripod", "pendant", "pendant"
-    )
+    kind: str = choice("floor", *["table"] * 3, "desk", "desk", "arc", "tripod", "pendant", "pendant")
     shade: str = choice("drum", "cone", "cone", "bell", "pleated", "dome", "globe", "bowl")
     base: str = choice("disc", "disc", "cube", "feet", "vase", "gourd", "turned", "bottle")
     arm: str = choice("single", "paired", "bent")
@@ -82,10 +80,8 @@ class Lamp:
         if self.base in ("disc", "cube", "feet"):
             made += [*self._plinth(), self._rod(0.4 * self.base_height, low, 1.25 * g)]
         else:
-            made += [
-                self._body(0.93 * low if self.kind == "table" else 0.4 * low),
-                self._rod(0.02, low, 1.25 * g),
-            ]
+            made.append(self._body(0.93 * low if self.kind == "table" else 0.4 * low))
+            made.append(self._rod(0.02, low, 1.25 * g))
         if self.collar:
             made.append(parts.ellipsoid((2.4 * g, 2.4 * g, 1.6 * g), (0, 0, 0.93 * low), 18))
         return made
@@ -97,21 +93,15 @@ class Lamp:
             return [parts.rounded_box((1.7 * r, 1.7 * r, 1.5 * h), (0, 0, 0.75 * h), 0.1 * h)]
         if self.base == "feet" and self.kind != "arc":
             made = [self._rod(0.5 * r, 0.9 * r, 2.2 * g)]
-            for a in 2 * np.pi * np.arange(3) / 3 - np.pi / 2:
-                way = np.array([np.cos(a), np.sin(a), 0])
-                path = parts.arc(
-                    0.8 * r * np.array([0, 0, 1]),
-                    1.25 * r * way + [0, 0, 1.3 * g],
-                    0.22 * r * (way + [0, 0, 1]),
-                )
-                made += [parts.tube(path, 1.25 * g, up=(-way[1], way[0], 0.0))]
+            for way in parts.spokes(3):
+                start, end = 0.8 * r * np.array([0, 0, 1]), 1.25 * r * way + [0, 0, 1.3 * g]
+                path = parts.arc(start, end, 0.22 * r * (way + [0, 0, 1]))
+                made.append(parts.tube(path, 1.25 * g, up=(-way[1], way[0], 0.0)))
                 made.append(parts.ellipsoid((1.9 * g, 1.9 * g, 1.5 * g), path[-1] + [0, 0, 0.2 * g], 14))
             return made
-        crown = (
-            [(0.55 * r, 1.25 * h), (2.2 * g, 1.45 * h), (1.4 * g, 2.2 * h)]
-            if self.collar
-            else [(0.96 * r, 1.1 * h)]
-        )
+        crown = [(0.96 * r, 1.1 * h)]
+        if self.collar:
+            crown = [(0.55 * r, 1.25 * h), (2.2 * g, 1.45 * h), (1.4 * g, 2.2 * h)]
         return [parts.lathe([(r, 0), (r, 0.7 * h), (0.98 * r, 0.9 * h), *crown], 40)]
 
     def _body(self, top: float) -> Manifold:
@@ -120,24 +110,13 @@ class Lamp:
         if self.kind == "floor":
             r *= 0.8
         neck = 2 * g
+        turned = [(r, 0), (r, 0.06), (0.5 * r, 0.1), (0.34 * r, 0.16), (0.62 * r, 0.2), (0.34 * r, 0.24)]
+        turned += [(0.58 * r, 0.2 + 0.5 * b), (0.3 * r, 0.74), (0.55 * r, 0.79), (0.28 * r, 0.84)]
         keys = {
             "vase": [(0.62 * r, 0), (0.5 * r, 0.06), (r, b), (0.42 * r, 0.86), (0.55 * r, 0.95), (neck, 1)],
             "gourd": [(0.7 * r, 0), (r, 0.5 * b + 0.05), (0.42 * r, 0.62), (0.62 * r, 0.8), (neck, 1)],
             "bottle": [(0.8 * r, 0), (0.95 * r, 0.04), (0.95 * r, b), (neck * 1.2, b + 0.2), (neck, 1)],
-            "turned": [
-                (r, 0),
-                (r, 0.06),
-                (0.5 * r, 0.1),
-                (0.34 * r, 0.16),
-                (0.62 * r, 0.2),
-                (0.34 * r, 0.24),
-                (0.58 * r, 0.2 + 0.5 * b),
-                (0.3 * r, 0.74),
-                (0.55 * r, 0.79),
-                (0.28 * r, 0.84),
-                (0.4 * r, 0.92),
-                (neck, 1),
-            ],
+            "turned": [*turned, (0.4 * r, 0.92), (neck, 1)],
         }[self.base]
         return parts.lathe([(rr, top * h) for rr, h in _smooth(keys)], 32)
 
@@ -148,7 +127,7 @@ class Lamp:
         start = np.array([0, rear, 0.7 * foot if self.base == "feet" else self.base_height * tall * 0.6])
         bend = np.array([0, rear + 0.3 * self.elbow * tall, (0.3 + 0.6 * self.elbow) * tall])
         end = np.array([0, -self.reach * 0.8 * tall, 0.86 * tall])
-        made = self._plinth() if self.base != "cube" else [self._block()]
+        made = self._plinth_or_block()
         if self.arm == "bent":
             corners = [start, start + [0, 0.02, 0.6 * tall], (0, 0.5 * end[1], 1.12 * tall), end]
             made.append(parts.tube(parts.filleted(corners, 0.16 * tall, 8), 1.2 * g, up=(1, 0, 0)))
@@ -161,9 +140,12 @@ class Lamp:
                 made.append(parts.bar(joint - half, joint + half, 2.2 * g))
         return [*made, self._hung_head(end, 0.6 * self.tilt)]
 
-    def _block(self) -> Manifold:
+    def _plinth_or_block(self) -> list[Manifold]:
+        """The base of a lamp that reaches out: a heavier block in place of the cube."""
+        if self.base != "cube":
+            return self._plinth()
         r, h = self._foot(), self.base_height * self.tall()
-        return parts.rounded_box((1.6 * r, 1.6 * r, 1.6 * h), (0, 0, 0.8 * h), 0.12 * h)
+        return [parts.rounded_box((1.6 * r, 1.6 * r, 1.6 * h), (0, 0, 0.8 * h), 0.12 * h)]
 
     def _hung_head(self, end: np.ndarray, tilt: float) -> Manifold:
         """The head turned by `tilt` degrees about the end of an arm, where its rod enters."""
@@ -179,8 +161,7 @@ class Lamp:
         drop = 0.1 + 0.16 * self.elbow
         rise = np.sin(0.5 * np.pi * t / (1 - drop))
         path = np.column_stack([0 * t, 0.42 * out - 1.25 * out * t**1.7, 0.02 + (0.97 * tall) * rise])
-        base = self._plinth() if self.base != "cube" else [self._block()]
-        made = [b.translate((0, 0.42 * out, 0)) for b in base]
+        made = [base.translate((0, 0.42 * out, 0)) for base in self._plinth_or_block()]
         made.append(parts.tube(path, 1.25 * g, up=(1, 0, 0)))
         return [*made, self._hung_head(path[-1], 0.4 * self.tilt)]
 
@@ -189,24 +170,15 @@ class Lamp:
         tall, g = self.tall(), self.gauge()
         low = tall - lamp_shades.height(self)
         hub, spread = 0.93 * low, 0.2 * tall * self.base_width * (0.7 + 0.5 * self.reach)
-        made = [lamp_shades.head(self, hung=False).translate((0, 0, low))]
-        made.append(
-            parts.lathe([(3.4 * g, hub - 0.03), (3.4 * g, hub + 0.02), (1.3 * g, hub + 0.04), (1.3 * g, low)])
-        )
-        thick = 1.5 * g
-        feet = []
-        for a in 2 * np.pi * np.arange(3) / 3 - np.pi / 2:
-            way = np.array([np.cos(a), np.sin(a), 0])
-            foot = spread * way
+        collar = [(3.4 * g, hub - 0.03), (3.4 * g, hub + 0.02), (1.3 * g, hub + 0.04), (1.3 * g, low)]
+        made = [lamp_shades.head(self, hung=False).translate((0, 0, low)), parts.lathe(collar)]
+        thick, feet = 1.5 * g, [spread * way for way in parts.spokes(3)]
+        for way, foot in zip(parts.spokes(3), feet, strict=True):
             made.append(parts.bar(1.2 * g * way + [0, 0, hub], foot, 1.25 * thick, 0.75 * thick))
-            feet.append(foot)
         if self.arm != "single":
             rung = [f * (1 - self.elbow) + [0, 0, self.elbow * hub] for f in feet]
-            hubs = (
-                [rung[1], rung[2], rung[0]]
-                if self.arm == "paired"
-                else [np.array([0, 0, self.elbow * hub])] * 3
-            )
+            centre = [np.array([0, 0, self.elbow * hub])] * 3
+            hubs = [rung[1], rung[2], rung[0]] if self.arm == "paired" else centre
             made += [parts.bar(a, b, 0.9 * g) for a, b in zip(rung, hubs, strict=True)]
         return made
 

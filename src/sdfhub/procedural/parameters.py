@@ -1,7 +1,6 @@
 """How a design's parameters are declared and drawn.
 
-A category is a frozen dataclass: every field is either a `continuous` number within a range or a `choice`
-among a few. The declaration is all that a draw, a test or a reader needs.
+A category is a frozen dataclass: a field is a `continuous` number within a range or a `choice` of options.
 """
 
 from dataclasses import field, fields

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
 
-SEGMENTS = 24
-"""Sides of a round part unless it says otherwise."""
+Point = Sequence[float]
+"""x, y, z."""
 
 
 def union(parts: Sequence[Manifold]) -> Manifold:
@@ -19,12 +19,12 @@ def union(parts: Sequence[Manifold]) -> Manifold:
     return Manifold.batch_boolean(list(parts), OpType.Add)
 
 
-def box(size: Sequence[float], centre: Sequence[float]) -> Manifold:
+def box(size: Point, centre: Point) -> Manifold:
     """An axis-aligned box with sharp edges."""
     return Manifold.cube(tuple(map(float, size)), True).translate(tuple(map(float, centre)))
 
 
-def rounded_box(size: Sequence[float], centre: Sequence[float], radius: float, steps: int = 3) -> Manifold:
+def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Manifold:
     """A box whose edges and corners are rounded with one radius: a cushion, a padded arm.
 
     Args:
@@ -36,11 +36,9 @@ def rounded_box(size: Sequence[float], centre: Sequence[float], radius: float, s
     half = np.asarray(size, float) / 2
     r = min(radius, 0.98 * half.min())
     theta = np.linspace(0, np.pi / 2, steps + 1)
-    octant = np.array(
-        [(np.cos(p) * np.cos(t), np.cos(p) * np.sin(t), np.sin(p)) for p in theta for t in theta]
-    )
+    octant = [(np.cos(p) * np.cos(t), np.cos(p) * np.sin(t), np.sin(p)) for p in theta for t in theta]
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], float)
-    points = (signs[:, None] * (half - r + r * octant)).reshape(-1, 3)
+    points = (signs[:, None] * (half - r + r * np.array(octant))).reshape(-1, 3)
     return Manifold.hull_points(np.ascontiguousarray(points + np.asarray(centre, float)))
 
 
@@ -93,23 +91,18 @@ def _loft_faces(k: int, n: int) -> np.ndarray:
     a, b = (i * n + j).ravel(), (i * n + (j + 1) % n).ravel()
     ring, following = np.arange(n), (np.arange(n) + 1) % n
     last = (k - 1) * n
-    faces = np.vstack(
-        [
-            np.column_stack([a, b, b + n]),
-            np.column_stack([a, b + n, a + n]),
-            np.column_stack([following, ring, np.full(n, k * n)]),
-            np.column_stack([last + ring, last + following, np.full(n, k * n + 1)]),
-        ]
-    )
-    return np.ascontiguousarray(faces.astype(np.uint64))
+    sides = np.column_stack([a, b, b + n]), np.column_stack([a, b + n, a + n])
+    low = np.column_stack([following, ring, np.full(n, k * n)])
+    high = np.column_stack([last + ring, last + following, np.full(n, k * n + 1)])
+    return np.ascontiguousarray(np.vstack([*sides, low, high]).astype(np.uint64))
 
 
-def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)) -> Manifold:
+def sweep(path: np.ndarray, section: np.ndarray, up: Point = (0, 0, 1)) -> Manifold:
     """A section carried along a path: a curved rail, a bent tube, a slat.
 
     Args:
         path: [K, 3]; its bends must be wider than the section.
-        section: [N, 2] or [K, N, 2] star-shaped polygon: first axis tangent x up, second along `up`.
+        section: [N, 2] star-shaped polygon: first axis tangent x up, second along `up`.
         up: direction the section's second axis follows; not parallel to the path.
     """
     path = np.asarray(path, float)
@@ -117,29 +110,21 @@ def sweep(path: np.ndarray, section: np.ndarray, up: Sequence[float] = (0, 0, 1)
     tangent = _unit(np.vstack([leaving[:1], leaving[:-1] + leaving[1:], leaving[-1:]]))
     side = _unit(np.cross(tangent, np.asarray(up, float)))
     over = np.cross(side, tangent)
-    section = np.broadcast_to(section, (len(path), *np.shape(section)[-2:]))
-    return loft(path[:, None] + section[..., :1] * side[:, None] + section[..., 1:] * over[:, None])
+    return loft(path[:, None] + section[:, :1] * side[:, None] + section[:, 1:] * over[:, None])
 
 
-def tube(
-    path: np.ndarray, radius: float | np.ndarray, segments: int = 12, up: Sequence[float] = (0, 0, 1)
-) -> Manifold:
-    """A round bar along a path; `radius` is one number or one per point of the path."""
-    radii = np.broadcast_to(radius, len(path))
-    return sweep(path, radii[:, None, None] * circle(segments), up)
+def tube(path: np.ndarray, radius: float, segments: int = 12, up: Point = (0, 0, 1)) -> Manifold:
+    """A round bar along a path."""
+    return sweep(path, radius * circle(segments), up)
 
 
-def bar(
-    start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None
-) -> Manifold:
+def bar(start: Point, end: Point, radius: float, end_radius: float | None = None) -> Manifold:
     """A straight round bar, tapered from radius to end_radius."""
-    end_radius = radius if end_radius is None else end_radius
-    return _along(lathe([(radius, 0.0), (end_radius, 1.0)], 14, stretch=False), start, end)
+    profile = [(radius, 0.0), (radius if end_radius is None else end_radius, 1.0)]
+    return _along(lathe(profile, 14, stretch=False), start, end)
 
 
-def square_bar(
-    start: Sequence[float], end: Sequence[float], width: float, end_width: float | None = None
-) -> Manifold:
+def square_bar(start: Point, end: Point, width: float, end_width: float | None = None) -> Manifold:
     """A straight bar of square section with its sides along x and y, cut level at both ends."""
     end_width = width if end_width is None else end_width
     square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
@@ -147,19 +132,19 @@ def square_bar(
     return loft(np.array(rings))
 
 
-def plank(start: Sequence[float], end: Sequence[float], thickness: float, height: float) -> Manifold:
+def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold:
     """A straight board on edge from start to end, its height along z."""
     half = np.array([thickness, height]) / 2
     section = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
     return sweep(np.array([start, end], float), section)
 
 
-def turned(start: Sequence[float], end: Sequence[float], profile: Sequence[tuple[float, float]]) -> Manifold:
+def turned(start: Point, end: Point, profile: Sequence[tuple[float, float]]) -> Manifold:
     """A lathe-turned bar: `profile` holds (radius, height), height from 0 at start to 1 at end."""
     return _along(lathe(profile, 18, stretch=False), start, end)
 
 
-def lathe(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS, stretch: bool = True) -> Manifold:
+def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, stretch: bool = True) -> Manifold:
     """A solid of revolution around z.
 
     Args:
@@ -168,9 +153,8 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = SEGMENTS, stre
         stretch: let the polygon's area equal the circle's, so that few sides do not shrink it.
     """
     profile = np.asarray(profile, float)
-    ring = circle(segments) * (
-        np.sqrt(2 * np.pi / segments / np.sin(2 * np.pi / segments)) if stretch else 1.0
-    )
+    turn = 2 * np.pi / segments
+    ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
     rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in profile]
     return loft(np.array(rings))
 
@@ -190,7 +174,7 @@ def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> 
     return Manifold.revolve(CrossSection([ring]), segments)
 
 
-def ellipsoid(radii: Sequence[float], centre: Sequence[float], segments: int = 24) -> Manifold:
+def ellipsoid(radii: Point, centre: Point, segments: int = 24) -> Manifold:
     """An ellipsoid with its axes along x, y and z."""
     return Manifold.sphere(1.0, segments).scale(tuple(map(float, radii))).translate(tuple(map(float, centre)))
 
@@ -201,9 +185,7 @@ def circle(segments: int) -> np.ndarray:
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def rounded_rectangle(
-    width: float, depth: float, radius: float, back_width: float | None = None
-) -> np.ndarray:
+def rounded_rectangle(width: float, depth: float, radius: float, back_width: float | None = None):
     """[N, 2] rectangle around 0 with rounded corners; `back_width` is its width at +y where it tapers."""
     back_width = width if back_width is None else back_width
     corners = [(-width, -depth, 180), (width, -depth, 270), (back_width, depth, 0), (-back_width, depth, 90)]
@@ -215,14 +197,14 @@ def rounded_rectangle(
     return np.vstack(points)
 
 
-def arc(start: Sequence[float], end: Sequence[float], bulge: Sequence[float], count: int = 9) -> np.ndarray:
+def arc(start: Point, end: Point, bulge: Point, count: int = 9) -> np.ndarray:
     """[count, 3] parabola from start to end whose middle is moved by `bulge`."""
     t = np.linspace(0, 1, count)[:, None]
     start, end, bulge = (np.asarray(v, float) for v in (start, end, bulge))
     return (1 - t) * start + t * end + 4 * t * (1 - t) * bulge
 
 
-def filleted(corners: Sequence[Sequence[float]], radius: float, steps: int = 4) -> np.ndarray:
+def filleted(corners: Sequence[Point], radius: float, steps: int = 4) -> np.ndarray:
     """[K, 3] polyline through `corners` with its bends rounded by about `radius`."""
     corners = np.asarray(corners, float)
     path = [corners[0]]
@@ -234,6 +216,32 @@ def filleted(corners: Sequence[Sequence[float]], radius: float, steps: int = 4) 
     return np.array([*path, corners[-1]])
 
 
+def spokes(count: int, first: float = -0.5) -> list[np.ndarray]:
+    """`count` unit vectors [3] evenly around z; the first points `first` half turns from +x (default: -y)."""
+    turns = 2 * np.pi * np.arange(count) / count + first * np.pi
+    return [np.array([np.cos(angle), np.sin(angle), 0]) for angle in turns]
+
+
+def scaled(profile: Sequence[tuple[float, float]], radius: float, length: float = 1.0) -> list:
+    """A profile (radius, height) whose numbers are given in shares of `radius` and `length`."""
+    return [(radius * share, length * along) for share, along in profile]
+
+
+def aprons(tops: Sequence[np.ndarray], height: float, thickness: float, tall: float) -> list[Manifold]:
+    """Boards at `height` between four legs (front left, front right, back left, back right)."""
+    level = [np.array([*top[:2], height]) for top in tops]
+    return [plank(level[a], level[b], thickness, tall) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))]
+
+
+def stretchers(joints: Sequence[np.ndarray], style: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Ends of the bars between four legs: along the sides, and for "h" and "box" also across."""
+    left, right, rear_left, rear_right = joints
+    sides = [(left, rear_left), (right, rear_right)]
+    if style == "h":
+        return [*sides, ((left + rear_left) / 2, (right + rear_right) / 2)]
+    return [*sides, (left, right), (rear_left, rear_right)] if style == "box" else sides
+
+
 def mirrored(part: Manifold) -> list[Manifold]:
     """The part and its mirror image across x = 0."""
     return [part, part.mirror((1.0, 0.0, 0.0))]
@@ -243,7 +251,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _along(unit: Manifold, start: Sequence[float], end: Sequence[float]) -> Manifold:
+def _along(unit: Manifold, start: Point, end: Point) -> Manifold:
     """A part of height 1 along z, moved and turned to run from start to end; its radii stay."""
     start = np.asarray(start, float)
     axis = np.asarray(end, float) - start

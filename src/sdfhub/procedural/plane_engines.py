@@ -9,14 +9,8 @@ from sdfhub.procedural import plane_parts as pp
 
 def powerplant(plane) -> list[Manifold]:
     """The engines that the plane's kind has; its `engines` doubles their number where that can be."""
-    kinds = {
-        "airliner": _underwing_jets,
-        "business jet": _rear_jets,
-        "turboprop": _wing_propellers,
-        "single": _nose_propeller,
-        "glider": lambda plane: [],
-        "fighter": _afterburners,
-    }
+    kinds = {"airliner": _underwing_jets, "business jet": _rear_jets, "turboprop": _wing_propellers}
+    kinds |= {"single": _nose_propeller, "glider": lambda plane: [], "fighter": _afterburners}
     return kinds[plane.kind](plane)
 
 
@@ -44,9 +38,8 @@ def _rear_jets(plane) -> list[Manifold]:
     y = 0.17 + plane.engine_shift
     z = body.axis(y + 0.05) + 0.4 * body.half_height(y + 0.05)
     centre = np.array([body.half_width(y) + 1.35 * r, y, z])
-    stub = pp.panel(
-        (0, y + 0.5 * r, z), (1, 0), centre[0] - 0.5 * r, (2.2 * r, 2.2 * r), 0, 0.16, plane.gauge
-    )
+    root, chords = (0, y + 0.5 * r, z), (2.2 * r, 2.2 * r)
+    stub = pp.panel(root, (1, 0), centre[0] - 0.5 * r, chords, 0, 0.16, plane.gauge)
     made = parts.mirrored(parts.union([pp.jet(r, 3.6 * r, centre), stub]))
     if plane.engines == 2 and plane.tail != "v":
         y = 0.27
@@ -60,22 +53,15 @@ def _wing_propellers(plane) -> list[Manifold]:
     first = plane.body.radius + tip + 0.025
     places = [first] if plane.engines == 1 else [first, first + 2 * tip + 0.025]
     made, r = [], 0.26 * tip
-    turning = parts.union(
-        pp.propeller(tip, 0.56 * r, plane.blades + 1, plane.gauge, (0, -0.088, 0), plane.blade_turn)
-    )
+    place, blades = (0, -0.088, 0), plane.blades + 1
+    turning = parts.union(pp.propeller(tip, 0.56 * r, blades, plane.gauge, place, plane.blade_turn))
     for x in places:
         share = x / plane.semi_span
         centre = plane.leading_edge(share) + [0, 0, -0.35 * r]
         chord = plane.wing_chord(share)
-        shape = [
-            (0.62, -0.085),
-            (0.85, -0.075),
-            (1, -0.04),
-            (1, 0.4 * chord),
-            (0.7, chord),
-            (0.25, 1.3 * chord),
-        ]
-        nacelle = pp.body_of_revolution([(r * q, t) for q, t in shape], centre)
+        shape = [(0.62, -0.085), (0.85, -0.075), (1, -0.04)]
+        shape += [(1, 0.4 * chord), (0.7, chord), (0.25, 1.3 * chord)]
+        nacelle = pp.body_of_revolution(parts.scaled(shape, r), centre)
         # Joined before they are mirrored: half the booleans.
         made += parts.mirrored(parts.union([nacelle, turning.translate(tuple(centre))]))
     return made
@@ -99,7 +85,7 @@ def _afterburners(plane) -> list[Manifold]:
     made, z = [], body.axis(0.5)
     for x in [0.0] if plane.engines == 1 else [-0.92 * r, 0.92 * r]:
         shape = [(1.12, 0.38), (1.12, 0.51), (0.92, 0.56), (0.64, 0.56), (0.54, 0.525), (0.1, 0.525)]
-        made.append(pp.body_of_revolution([(r * q, y) for q, y in shape], (x, 0, z)))
+        made.append(pp.body_of_revolution(parts.scaled(shape, r), (x, 0, z)))
     return made + parts.mirrored(_intake(plane))
 
 

@@ -43,11 +43,6 @@ def _leg(plane, top: np.ndarray, axle: np.ndarray, radius: float) -> list[Manifo
         return made + [pp.wheel(radius, 0.8 * radius, axle + s * offset) for s in (-1, 1)]
     made.append(pp.wheel(radius, max(0.7 * radius, 1.8 * plane.gauge), axle))
     if plane.kind == "single" and plane.spats:
-        made.append(
-            parts.ellipsoid(
-                (0.55 * radius + 0.004, 1.7 * radius, 0.7 * radius),
-                axle + [0, 0.3 * radius, 0.3 * radius],
-                16,
-            )
-        )
+        radii = 0.55 * radius + 0.004, 1.7 * radius, 0.7 * radius
+        made.append(parts.ellipsoid(radii, axle + [0, 0.3 * radius, 0.3 * radius], 16))
     return made

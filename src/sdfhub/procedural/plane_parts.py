@@ -170,8 +170,7 @@ def jet(radius: float, length: float, centre) -> Manifold:
     inlet = [(0.66, 0.28), (0.7, 0.04), (0.78, 0.0), (0.86, 0.0)]
     cowl = [(0.94, 0.03), (1.0, 0.16), (1.0, 0.4), (0.9, 0.7), (0.74, 0.86), (0.44, 0.87)]
     cone = [(0.36, 0.98), (0.16, 1.12)]
-    profile = [(radius * q, length * t) for q, t in spinner + inlet + cowl + cone]
-    return body_of_revolution(profile, centre, 20)
+    return body_of_revolution(parts.scaled(spinner + inlet + cowl + cone, radius, length), centre, 20)
 
 
 def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
@@ -186,16 +185,11 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
         turn: angle of the first blade, degrees.
     """
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
-    made = [body_of_revolution([(hub * q, hub * t) for q, t in profile], centre, 14)]
+    made = [body_of_revolution(parts.scaled(profile, hub, hub), centre, 14)]
     chord = max(0.22 * radius, 2.2 * gauge)
     sections = []
-    for share, width, twist in (
-        (0.0, 0.5, 60),
-        (0.3, 0.8, 45),
-        (0.6, 1.0, 28),
-        (0.92, 0.85, 18),
-        (1, 0.5, 16),
-    ):
+    stations = (0.0, 0.5, 60), (0.3, 0.8, 45), (0.6, 1.0, 28), (0.92, 0.85, 18), (1, 0.5, 16)
+    for share, width, twist in stations:
         ring = superellipse(10, 2.5) * [width * chord / 2, gauge / 2]
         c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
         flat = ring @ np.array([[c, s], [-s, c]])

@@ -95,15 +95,10 @@ class Plane:
         body = self.body.solid()
         if self.kind in ("airliner", "business jet", "turboprop"):
             body = self._windscreen(body)
-        solids = [
-            body,
-            *self._wing(),
-            *plane_tails.tail(self),
-            *plane_engines.powerplant(self),
-            *self._canopy(),
-            *plane_gear.gear(self),
-        ]
-        return parts.union(solids).scale((self.base.length * self.size,) * 3)
+        solids = [body, *self._wing(), *plane_tails.tail(self), *plane_engines.powerplant(self)]
+        return parts.union([*solids, *self._canopy(), *plane_gear.gear(self)]).scale(
+            (self.base.length * self.size,) * 3
+        )
 
     @property
     def base(self) -> Proportions:
@@ -174,7 +169,7 @@ class Plane:
             return [wing]
         r, a = 1.25 * self.gauge, 1.5 * max(self.wing_chord(1), 0.09)
         shape = [(0.15, -0.5), (0.6, -0.42), (0.95, -0.28), (1, 0), (0.9, 0.25), (0.5, 0.43), (0.2, 0.5)]
-        tank = pp.body_of_revolution([(r * q, a * t) for q, t in shape], self.wing_point(0.99, 0.5), 16)
+        tank = pp.body_of_revolution(parts.scaled(shape, r, a), self.wing_point(0.99, 0.5), 16)
         return [wing, *parts.mirrored(tank)]
 
     def _wing_tip(self, roll: float) -> list[pp.Station]:
@@ -200,21 +195,16 @@ class Plane:
         body, tall = self.body, self.canopy_height * self.body.half_height(0)
         front = -0.5 + 0.55 * body.nose
         if self.kind == "single":
-            front = -0.5 + body.nose + 0.03
-            rear = 0.16 if self.mount == "high" else 0.1
-            wide, high = 0.86 * body.radius, tall * 0.75 + 0.4 * body.half_height(0)
-            return [
-                pp.canopy(front, rear, 0.42, lambda y: body.axis(y) + 0.35 * body.half_height(y), wide, high)
-            ]
-        if self.kind in ("glider", "fighter"):
-            length = 0.24 if self.kind == "fighter" else 0.2
-            wide, high = 0.62 * body.radius, 0.85 * tall
-            return [
-                pp.canopy(
-                    front, front + length, 0.4, lambda y: body.axis(y) + 0.4 * body.half_height(y), wide, high
-                )
-            ]
-        centre = self.wing_point(0, 0.5) * [0, 1, 0.95]
-        return [
-            parts.ellipsoid((0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius), centre, 20)
-        ]
+            front, rear = -0.5 + body.nose + 0.03, 0.16 if self.mount == "high" else 0.1
+            peak, foot, wide, high = 0.42, 0.35, 0.86, tall * 0.75 + 0.4 * body.half_height(0)
+        elif self.kind in ("glider", "fighter"):
+            rear = front + (0.24 if self.kind == "fighter" else 0.2)
+            peak, foot, wide, high = 0.4, 0.4, 0.62, 0.85 * tall
+        else:
+            radii = 0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius
+            return [parts.ellipsoid(radii, self.wing_point(0, 0.5) * [0, 1, 0.95], 20)]
+
+        def base(y: float) -> float:
+            return body.axis(y) + foot * body.half_height(y)
+
+        return [pp.canopy(front, rear, peak, base, wide * body.radius, high)]

@@ -8,15 +8,8 @@ from sdfhub.procedural import parts, sofa_cushions
 
 def back(sofa) -> list[Manifold]:
     """The parts of the sofa's back, rooted in its frame."""
-    styles = {
-        "tight": _tight,
-        "cushions": _cushions,
-        "channels": _channels,
-        "camel": _camel,
-        "tufted": _tufted,
-        "chesterfield": _chesterfield,
-    }
-    return styles[sofa.back](sofa)
+    styles = dict(tight=_tight, cushions=_cushions, channels=_channels, camel=_camel, tufted=_tufted)
+    return styles.get(sofa.back, _chesterfield)(sofa)
 
 
 def _half(sofa) -> float:

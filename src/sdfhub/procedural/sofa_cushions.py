@@ -68,26 +68,18 @@ def loose(sofa) -> list[Manifold]:
     if sofa.seats == 1:
         return [_pillow(size, (0, back - 0.1, z), 0.0)]
     first = _pillow(size, (x, back - 0.12, z), -18.0)
-    return (
-        [first] if sofa.pillows == "one" else [first, _pillow(0.92 * size, (-x, back - 0.12, z - 0.02), 14.0)]
-    )
+    if sofa.pillows == "one":
+        return [first]
+    return [first, _pillow(0.92 * size, (-x, back - 0.12, z - 0.02), 14.0)]
 
 
 def _bolsters(sofa, back: float) -> list[Manifold]:
     r, length = 0.24 * sofa.pillow_size, min(1.15 * sofa.pillow_size, back - sofa.front - 0.06)
-    profile = [
-        (0.3, 0),
-        (0.82, 0.008),
-        (0.95, 0.04),
-        (1, 0.1),
-        (1, 0.9),
-        (0.95, 0.96),
-        (0.82, 0.992),
-        (0.3, 1),
-    ]
+    profile = [(0.3, 0), (0.82, 0.008), (0.95, 0.04), (1, 0.1)]
+    profile += [(1, 0.9), (0.95, 0.96), (0.82, 0.992), (0.3, 1)]
     x, z = sofa.half_seat - 0.92 * r, sofa.seat_height + 0.88 * r + 0.3 * sofa.crown
     start, end = (x, back + 0.02 - length, z), (x, back + 0.02, z)
-    return parts.mirrored(parts.turned(start, end, [(r * a, h) for a, h in profile]))
+    return parts.mirrored(parts.turned(start, end, parts.scaled(profile, r)))
 
 
 def _pillow(size: float, centre, yaw: float) -> Manifold:

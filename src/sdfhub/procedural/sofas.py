@@ -85,8 +85,7 @@ class Sofa:
         """The chaise's left and right ends in x, or None."""
         if self.chaise == "none":
             return None
-        width = max(2 * self.half_seat / self.seats, 0.58)
-        width = min(width, 2 * self.half_seat)
+        width = min(max(2 * self.half_seat / self.seats, 0.58), 2 * self.half_seat)
         ends = (self.half_seat - width, self.half_seat)
         return ends if self.chaise == "right" else (-ends[1], -ends[0])
 
@@ -121,11 +120,8 @@ class Sofa:
     def _sloped_arm(self, low: float) -> Manifold:
         """An arm whose top falls from the back to the front."""
         high = self.seat_height + self.arm_height + (self.back_height - self.arm_height) * self.arm_slope
-        ends = []
-        for y, top in (
-            (self.front + 0.06, self.seat_height + 0.5 * self.arm_height),
-            (self.rear - 0.06, high),
-        ):
+        ends, low_front = [], self.seat_height + 0.5 * self.arm_height
+        for y, top in ((self.front + 0.06, low_front), (self.rear - 0.06, high)):
             centre = (self.half_seat + self.arm_width / 2, y, (low + top) / 2)
             ends.append(parts.rounded_box((self.arm_width, 0.1, top - low), centre, 0.03, 4))
         return Manifold.batch_hull(ends)
@@ -137,9 +133,8 @@ class Sofa:
         top = self.seat_height + self.arm_height - radius
         width = 0.84 * self.arm_width
         roll = CrossSection.circle(radius, 32).translate((centre, top))
-        upright = CrossSection.square((width, top - self.leg_height)).translate(
-            (self.half_seat - 0.002, self.leg_height)
-        )
+        upright = CrossSection.square((width, top - self.leg_height))
+        upright = upright.translate((self.half_seat - 0.002, self.leg_height))
         arm = Manifold.extrude(roll + upright, self.rear - self.front - 0.03)
         return arm.rotate((90, 0, 0)).translate((0, self.rear - 0.012, 0))
 
@@ -147,18 +142,12 @@ class Sofa:
         """A side panel that shelters the head, in the plane of y and z."""
         if self.arms != "wing":
             return []
-        rise, base = self.back_height, self.seat_height
-        curve = parts.filleted(
-            [
-                (self.rear - 0.02, base - 0.1, 0),
-                (0.02 * self.seat_depth, base - 0.1, 0),
-                (0.12 * self.seat_depth, base + 0.7 * self.arm_height, 0),
-                (0.12 * self.seat_depth, base + 0.97 * rise, 0),
-                (self.rear + self.back_lean - 0.04, base + 0.99 * rise, 0),
-                (self.rear + 0.5 * self.back_lean - 0.03, base + 0.4 * rise, 0),
-            ],
-            0.07,
-        )[::-1, :2]
+        rise, base, front = self.back_height, self.seat_height, 0.12 * self.seat_depth
+        corners = [(self.rear - 0.02, base - 0.1, 0), (0.02 * self.seat_depth, base - 0.1, 0)]
+        corners += [(front, base + 0.7 * self.arm_height, 0), (front, base + 0.97 * rise, 0)]
+        corners.append((self.rear + self.back_lean - 0.04, base + 0.99 * rise, 0))
+        corners.append((self.rear + 0.5 * self.back_lean - 0.03, base + 0.4 * rise, 0))
+        curve = parts.filleted(corners, 0.07)[::-1, :2]
         thick = 0.055 + 0.1 * self.arm_width
         panel = Manifold.extrude(CrossSection([curve]), thick)
         turned = panel.transform(np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]], float))
@@ -205,7 +194,7 @@ class Sofa:
             return parts.bar(foot, top, 0.45 * w, 0.75 * w)
         bun = [(0.5, 0), (0.62, 0.06), (0.95, 0.25), (1.05, 0.42), (0.9, 0.58), (0.55, 0.66)]
         bun += [(0.75, 0.7), (0.75, 0.76), (0.9, 0.8), (0.9, 1.0)]
-        return parts.turned((*top[:2], 0.0), top, [(w * r, h) for r, h in bun])
+        return parts.turned((*top[:2], 0.0), top, parts.scaled(bun, w))
 
     def _sled(self) -> list[Manifold]:
         """Loops of bent tube that run from front to back."""

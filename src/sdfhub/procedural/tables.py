@@ -63,12 +63,8 @@ class Table:
         return np.sign(unit) * np.abs(unit) ** power * [length / 2, depth / 2]
 
     def _top(self) -> Manifold:
-        return parts.pad(
-            self._outline(),
-            self.height - self.top_thickness,
-            self.height,
-            self.edge_round * self.top_thickness,
-        )
+        bottom, radius = self.height - self.top_thickness, self.edge_round * self.top_thickness
+        return parts.pad(self._outline(), bottom, self.height, radius)
 
     def _corner(self) -> np.ndarray:
         """(x, y) of the legs' axes in the quadrant where both are positive, under every kind of top."""
@@ -114,17 +110,13 @@ class Table:
         waist = 0.55 + 0.25 * taper
         knots = [(0.5, 0), (0.72, 0.02), (0.72, 0.06), (0.5, 0.1), (0.55, 0.13), (waist, 0.3), (1.05, 0.72)]
         knots += [(0.95, 0.84), (0.6, 0.88), (0.9, 0.92), (0.9, 0.96), (0.62, 1.0)]
-        turned = parts.turned(foot, foot + (top - foot) * block, [(r * a, s) for a, s in knots])
+        turned = parts.turned(foot, foot + (top - foot) * block, parts.scaled(knots, r))
         return [turned, parts.square_bar(foot + (top - foot) * (block - 0.01), top, w)]
 
     def _aprons(self, tops: list[np.ndarray]) -> list[Manifold]:
         """Boards between the legs; drawer fronts with knobs in the front one."""
         z = self.height - self.top_thickness - self.apron_height / 2 + 0.01
-        made = []
-        for a, b in ((0, 1), (2, 3), (0, 2), (1, 3)):
-            start, end = tops[a].copy(), tops[b].copy()
-            start[2] = end[2] = z
-            made.append(parts.plank(start, end, 0.024, self.apron_height + 0.02))
+        made = parts.aprons(tops, z, 0.024, self.apron_height + 0.02)
         x, y = self._corner()
         width = 2 * x - self.leg_width
         for k in range(self.drawers):
@@ -142,26 +134,19 @@ class Table:
         if self.stretchers == "shelf":
             shelf = 2 * np.abs(joints[0][:2])
             return [parts.box((*shelf, 0.026), (0, 0, joints[0][2]))]
-        thick, tall = 0.028, 0.04
-        pairs = [(joints[0], joints[2]), (joints[1], joints[3])]
-        if self.stretchers == "box":
-            pairs += [(joints[0], joints[1]), (joints[2], joints[3])]
-        else:
-            pairs.append(((joints[0] + joints[2]) / 2, (joints[1] + joints[3]) / 2))
+        pairs = parts.stretchers(joints, self.stretchers)
         if self.base == "square":
-            return [parts.plank(a, b, thick, tall) for a, b in pairs]
+            return [parts.plank(a, b, 0.028, 0.04) for a, b in pairs]
         return [parts.turned(a, b, [(0.015, 0), (0.021, 0.5), (0.015, 1)]) for a, b in pairs]
 
     def _trestle(self) -> list[Manifold]:
         """Two uprights on long feet, tied by a beam."""
         x, y = self._corner() * [0.78, 0.95]
-        w, foot, made = self.leg_width, 0.07, []
+        w, foot, top, made = self.leg_width, 0.07, self._under(), []
         for side in (-x, x):
             made.append(parts.rounded_box((1.15 * w, 2 * y, foot), (side, 0, foot / 2), 0.02))
-            made.append(
-                parts.square_bar((side, 0, 0.5 * foot), (side, 0, self._under()), w * (2.4 - self.leg_taper))
-            )
-            made.append(parts.rounded_box((1.1 * w, 1.7 * y, 0.06), (side, 0, self._under() - 0.02), 0.015))
+            made.append(parts.square_bar((side, 0, 0.5 * foot), (side, 0, top), w * (2.4 - self.leg_taper)))
+            made.append(parts.rounded_box((1.1 * w, 1.7 * y, 0.06), (side, 0, top - 0.02), 0.015))
         z = self.height * (0.2 + self.stretcher_height)
         made.append(parts.plank((-x - 0.08, 0, z), (x + 0.08, 0, z), 0.034, 0.075))
         return made
@@ -169,15 +154,12 @@ class Table:
     def _cross(self) -> list[Manifold]:
         """Two X-shaped frames, tied where their bars cross."""
         x, y = self._corner() * [0.86, 1.0]
-        thick, made, low = 0.6 * self.leg_width, [], 0.0
+        thick, top, made = 0.6 * self.leg_width, self._under(), []
         for side in (-x, x):
             for tilt in (-1, 1):
-                start, end = (side, -tilt * y, low), (side, tilt * y * 0.92, self._under())
-                made.append(parts.square_bar(start, end, thick))
-            made.append(
-                parts.plank((side, -y, self._under() - 0.02), (side, y, self._under() - 0.02), thick, 0.05)
-            )
-        z = self._under() / 1.92
+                made.append(parts.square_bar((side, -tilt * y, 0.0), (side, tilt * y * 0.92, top), thick))
+            made.append(parts.plank((side, -y, top - 0.02), (side, y, top - 0.02), thick, 0.05))
+        z = top / 1.92
         made.append(parts.bar((-x, 0, z), (x, 0, z), 0.4 * thick + 0.006))
         return made
 
@@ -187,14 +169,9 @@ class Table:
         column = parts.union(self._column(self.foot_reach * depth / 2 + 0.08))
         if length < 1.45 * depth:
             return [column]
-        beam = parts.plank(
-            (-0.25 * length, 0, self._under() - 0.03), (0.25 * length, 0, self._under() - 0.03), 0.05, 0.06
-        )
-        return [
-            column.translate((-0.25 * length, 0.0, 0.0)),
-            column.translate((0.25 * length, 0.0, 0.0)),
-            beam,
-        ]
+        x, z = 0.25 * length, self._under() - 0.03
+        beam = parts.plank((-x, 0, z), (x, 0, z), 0.05, 0.06)
+        return [column.translate((-x, 0.0, 0.0)), column.translate((x, 0.0, 0.0)), beam]
 
     def _column(self, reach: float) -> list[Manifold]:
         r, z, low = 0.85 * self.leg_width, self._under(), 0.14 * self.height
@@ -204,8 +181,7 @@ class Table:
         made = [parts.lathe([(r * a, low + (z - low) * h) for a, h in knots], 28)]
         thick = 0.5 * self.leg_width + 0.008
         drop = [(0.0, 0.22), (0.25, 0.225), (0.5, 0.16), (0.75, 0.07), (1.0, 0.034)]
-        for angle in 2 * np.pi * np.arange(self.feet) / self.feet - np.pi / 2:
-            out = np.array([np.cos(angle), np.sin(angle), 0])
+        for out in parts.spokes(self.feet):
             path = np.array([reach * a * out + [0, 0, h * self.height + 0.01] for a, h in drop])
             made.append(parts.sweep(path, parts.rounded_rectangle(thick, 0.07, 0.012)))
             made.append(parts.ellipsoid((thick, thick, 0.034), reach * out + [0, 0, 0.034], 14))
@@ -219,12 +195,9 @@ class Table:
         for side in (-1, 1):
             foot, top = side * (x - 0.6 * self.leg_splay), side * x
             ring = parts.rounded_rectangle(thick, 2 * y, 0.006)
-            bottom = np.column_stack([ring + [foot, 0], np.zeros(len(ring))])
-            made.append(
-                parts.loft(
-                    np.array([bottom, np.column_stack([ring + [top, 0], np.full(len(ring), self._under())])])
-                )
-            )
+            ends = ((foot, 0.0), (top, self._under()))
+            rings = [np.column_stack([ring + [c, 0], np.full(len(ring), level)]) for c, level in ends]
+            made.append(parts.loft(np.array(rings)))
         z = self.height - self.top_thickness - self.apron_height / 2 + 0.01
         made.append(parts.plank((-x, 0, z), (x, 0, z), 0.03, self.apron_height + 0.02))
         if self.stretchers == "shelf":

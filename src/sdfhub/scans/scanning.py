@@ -4,9 +4,8 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.data.preparation.visibility import points_on_faces
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import NormalizedMesh
-from sdfhub.triangles import face_normals
 
 HALF_VIEW = np.tan(np.radians(24))
 """Half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away."""
@@ -23,11 +22,8 @@ def surface_scan(
         noise: standard deviation along each axis, normalised frame.
         rng: of the points.
     """
-    normals = face_normals(mesh.vertices, mesh.faces)
-    area = np.linalg.norm(normals, axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    points = points_on_faces(mesh.vertices[mesh.faces], face, rng)
-    return points + noise * rng.standard_normal(points.shape), normals[face] / area[face, None]
+    points, normals = sample_surface(mesh.vertices, mesh.faces, count, rng)
+    return points + noise * rng.standard_normal(points.shape), normals
 
 
 def view_scan(

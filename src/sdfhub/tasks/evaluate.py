@@ -25,23 +25,21 @@ def evaluate_run(config: DictConfig) -> dict[str, Any]:
     out = beside(str(run), config.out, "evaluation")
     evaluation = instantiate(config.evaluate, "evaluate")
     trained, roles_then = read_run(run)
-    space = load(run, trust=config.trust or ())
-    then = data_of(trained, config.trust or ())
-    data, is_same = then, True
-    if config.data.get("_target_"):  # another source, or the same with other settings
-        data = instantiate(config.data, "data")
+    trust = config.trust or ()
+    space, data = load(run, trust=trust), data_of(trained, trust)
+    then, is_same = data.source, True
+    if config.data.get("source"):  # another source, or the same with other settings
+        data.source = instantiate(config.data.source, "data.source")
         is_same = plain(config.data)["source"] == trained["data"]["source"]
     data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
     # under other settings (categories, count) a source of the same name offers shapes of the same ids
-    seen = set(roles_then["train"]) if data.source.name == then.source.name else set()
+    seen = set(roles_then["train"]) if data.source.name == then.name else set()
     roles = choose_shapes(data.source, roles_then if is_same else {"train": [], "held_out": []}, seen, config)
     log.info("shapes: %d of the training, %d held out", len(roles.train), len(roles.held_out))
-    data.prepare(roles)
-    train = {roles_then["train"].index(shape.id): shape for shape in data.train_shapes}
+    shapes, held_out = data.prepared(roles)
+    train = {roles_then["train"].index(shape.id): shape for shape in shapes}
     delta = space.model["loss"]["delta"]
-    return evaluate_model(
-        space.decoder, space.codes, delta, train, data.held_out_shapes, evaluation, out
-    )
+    return evaluate_model(space.decoder, space.codes, delta, train, held_out, evaluation, out)
 
 
 def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:

@@ -4,11 +4,11 @@ import numpy as np
 
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
 from sdfhub.errors import RejectedMesh
-from sdfhub.shapes import RADIUS, NormalizedMesh
+from sdfhub.shapes import Frame, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
 ZERO_AREA = 1e-15
-"""Area, in normalised units squared, that rounding alone may leave of a line; such a triangle has none."""
+"""Area, normalised units squared, up to which a triangle counts as a line: rounding may leave so much."""
 
 
 def normalize_mesh(
@@ -16,9 +16,8 @@ def normalize_mesh(
 ) -> NormalizedMesh:
     """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
 
-    The frame comes before the merging: a tolerance means something only once the size is known, and a mesh
-    of scale 1e20 or 1e-12 must survive it. Triangles with the same three corners count once, whichever way
-    they turn.
+    Vertices are merged in the normalised frame, where a tolerance means the same for every mesh, be its scale
+    1e20 or 1e-12. Triangles with the same three corners count once, whichever way they turn.
 
     Args:
         vertices: [V, 3] numbers, source units.
@@ -30,15 +29,16 @@ def normalize_mesh(
     vertices, faces = _checked_arrays(vertices, faces)
     if len(faces) < preparation.min_faces:
         raise RejectedMesh("too_few_faces", f"{len(faces)} faces, at least {preparation.min_faces} wanted")
-    vertices, center, scale = _normalized(vertices, faces, preparation.min_extent_ratio)
-    vertices, faces = _merged(vertices, faces)
+    used, faces = np.unique(faces, return_inverse=True)
+    frame, vertices = _normalized(vertices[used], preparation.min_extent_ratio)
+    vertices, faces = _merged(vertices, faces.reshape(-1, 3))
     faces = _with_area(vertices, faces, preparation.max_zero_area)
     faces = _without_repeats(faces, len(vertices))
     count = piece_count(faces, len(vertices))
     if count > preparation.max_components:
         limit = preparation.max_components
         raise RejectedMesh("too_many_components", f"{count} pieces, at most {limit} wanted")
-    return NormalizedMesh(vertices, faces, center, scale)
+    return NormalizedMesh(vertices, faces, frame)
 
 
 def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,46 +64,29 @@ def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return vertices, faces
 
 
-def _normalized(
-    vertices: np.ndarray, faces: np.ndarray, min_extent_ratio: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    used = _used(faces, len(vertices))
-    corners = vertices[used]
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    half = high / 2 - low / 2  # halves first: the sum of two large numbers may overflow
-    if not half.max() > 0 or half.min() / half.max() < min_extent_ratio:
-        ratio = half.min() / half.max() if half.max() > 0 else 0.0
+def _normalized(corners: np.ndarray, min_extent_ratio: float) -> tuple[Frame, np.ndarray]:
+    half = corners.max(axis=0) / 2 - corners.min(axis=0) / 2  # halves first: a sum may overflow
+    ratio = half.min() / half.max() if half.max() > 0 else 0.0
+    if not half.max() > 0 or ratio < min_extent_ratio:
         detail = f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted"
         raise RejectedMesh("flat", detail)
-    center = high / 2 + low / 2
-    unit = (vertices - center) / half.max()  # near 1 before squares are taken
-    farthest = np.linalg.norm(unit[used], axis=1).max()
-    scale = RADIUS / farthest / half.max()
-    if not (np.isfinite(scale) and scale > 0):
-        raise RejectedMesh("extent_out_of_range", f"largest extent {2 * half.max():.2g} cannot be normalised")
-    return unit * (RADIUS / farthest), center, float(scale)
+    try:
+        return Frame.around(corners)
+    except ValueError as error:
+        what = f"largest extent {2 * half.max():.2g} cannot be normalised"
+        raise RejectedMesh("extent_out_of_range", what) from error
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that share a cell of width 1e-6 become the first of them; unused ones go."""
-    used = _used(faces, len(vertices))
-    cells = np.floor((vertices[used] + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
+    """Vertices that share a cell of width 1e-6 become the first of them."""
+    cells = np.floor((vertices + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
     keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
     _, first, row = np.unique(keys, return_index=True, return_inverse=True)
-    merged = np.empty(len(vertices), np.int64)
-    merged[used] = row
-    return vertices[used][first], merged[faces]
-
-
-def _used(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Rows of the vertices that have a face, ascending."""
-    is_used = np.zeros(vertex_count, bool)
-    is_used[faces.ravel()] = True
-    return np.flatnonzero(is_used)
+    return vertices[first], row[faces]
 
 
 def _without_repeats(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """The first of the faces with the same three corners, in the order of these."""
+    """The first of all faces with the same three corners, sorted by their corners."""
     low, middle, high = np.sort(faces, axis=1).T
     pair = np.unique(low * vertex_count + middle, return_inverse=True)[1]  # numbers, faster than rows
     return faces[np.unique(pair * vertex_count + high, return_index=True)[1]]

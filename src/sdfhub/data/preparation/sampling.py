@@ -6,11 +6,12 @@ import numpy as np
 
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, morton_order, nearest_points
-from sdfhub.data.preparation.visibility import Surface, closed_surface, points_on_faces, visible_surface
+from sdfhub.data.preparation.signs import SIGN_METHODS, nearest_points
+from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.geometry.morton import morton_order
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import NormalizedMesh, ShapeSamples
-from sdfhub.triangles import face_normals
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,9 +21,7 @@ PROBES = 2000
 
 
 def prepare_mesh(
-    mesh: "trimesh.Trimesh | tuple[np.ndarray, np.ndarray]",
-    preparation: Preparation = DEFAULT,
-    seed: int = 0,
+    mesh: "trimesh.Trimesh | tuple[np.ndarray, np.ndarray]", preparation: Preparation = DEFAULT, seed: int = 0
 ) -> ShapeSamples:
     """Signed distances and oriented surface points of one mesh, however broken, in the normalised frame.
 
@@ -59,9 +58,8 @@ def prepare_mesh(
         sdf=sdf.astype(np.float32),
         surface_points=surface_points.astype(np.float32),
         surface_normals=surface_normals.astype(np.float32),
-        center=normalized.center,
-        scale=normalized.scale,
-        mesh=NormalizedMesh(surface.vertices, surface.faces, normalized.center, normalized.scale),
+        frame=normalized.frame,
+        mesh=NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
         statistics=statistics,
     )
 
@@ -71,7 +69,7 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
     near = round(preparation.samples * preparation.near_share)
     points = np.empty((preparation.samples, 3), np.float32)
     deviation = np.sqrt(preparation.variances).astype(np.float32)
-    points[:near] = _area_weighted(surface.vertices, surface.faces, near, rng)[0]
+    points[:near] = sample_surface(surface.vertices, surface.faces, near, rng)[0]
     jitter = rng.standard_normal((near, 3), np.float32)
     jitter *= deviation[np.arange(near) % len(deviation), None]
     points[:near] += jitter
@@ -80,7 +78,7 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
 
 
 def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: np.random.Generator):
-    """Shuffled points [N, 3], their signed distances [N], and what was found."""
+    """Shuffled points [N, 3], their signed distances [N], and statistics."""
     points = sample_points(surface, preparation, rng)
     nearest = nearest_points(points, surface)
     signs = SIGN_METHODS[sign](points, nearest, surface, rng)
@@ -93,38 +91,26 @@ def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: 
     return points[order], sdf[order], statistics
 
 
-def _check_signs(found: dict[str, float], preparation: Preparation) -> None:
-    if found["certain"] < preparation.min_certain:
-        raise RejectedMesh(
-            "ambiguous_signs",
-            f"{found['certain']:.1%} certain, at least {preparation.min_certain:.0%} wanted",
-        )
-    low, high = preparation.min_inside, preparation.max_inside
-    if not low <= found["inside"] <= high:
-        raise RejectedMesh("inside_fraction", f"{found['inside']:.2%} inside, {low:.1%} to {high:.0%} wanted")
+def _check_signs(statistics: dict[str, float], preparation: Preparation) -> None:
+    certain, inside = statistics["certain"], statistics["inside"]
+    least, low, high = preparation.min_certain, preparation.min_inside, preparation.max_inside
+    if certain < least:
+        raise RejectedMesh("ambiguous_signs", f"{certain:.1%} certain, at least {least:.0%} wanted")
+    if not low <= inside <= high:
+        raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
 
 
 def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> bool:
     """Whether the winding number confirms the pseudo-normal, which self-intersections mislead."""
-    probes = points[:PROBES]
-    probes = probes[morton_order(probes)]
+    order = morton_order(points[:PROBES])
+    probes, sdf = points[order], sdf[order]
     inside = SIGN_METHODS["winding"](probes, nearest_points(probes, surface), surface, rng).inside
-    return np.mean(inside != (sdf[:PROBES][morton_order(points[:PROBES])] < 0)) < 0.002
-
-
-def _area_weighted(
-    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """[count, 3] points spread evenly over the faces, face by face, and their faces' unit normals."""
-    normals = face_normals(vertices, faces)
-    area = np.linalg.norm(normals, axis=1)
-    face = np.repeat(np.arange(len(faces)), rng.multinomial(count, area / area.sum()))
-    return points_on_faces(vertices[faces], face, rng), normals[face] / area[face, None]
+    return np.mean(inside != (sdf < 0)) < 0.002
 
 
 def _oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    points, normals = _area_weighted(surface.vertices, surface.solid(), count, rng)
+    points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
     order = rng.permutation(count)
     return points[order], normals[order]

@@ -59,12 +59,9 @@ class Preparation:
 
     def __post_init__(self):
         object.__setattr__(self, "variances", tuple(self.variances))  # YAML gives a list
+        methods = "winding", "vote", "pseudo_normal"
         for name, valid, wanted in (
-            (
-                "sign",
-                self.sign in ("winding", "vote", "pseudo_normal"),
-                "one of winding, vote, pseudo_normal",
-            ),
+            ("sign", self.sign in methods, f"one of {', '.join(methods)}"),
             ("samples", self.samples >= 1, "at least 1"),
             ("near_share", 0 <= self.near_share <= 1, "within [0, 1]"),
             ("variances", len(self.variances) > 0 and min(self.variances) > 0, "positive numbers"),

@@ -1,4 +1,4 @@
-"""Inside or outside: rival methods with one signature, and the exact distance that they share.
+"""Inside or outside: rival methods with one signature, and the exact distance for all of them.
 
 libigl's own signed distance by fast winding number returns wrong magnitudes, so the sign and the distance
 are computed apart and combined by the caller.
@@ -12,17 +12,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sdfhub.data.preparation.pieces import cut_long
-from sdfhub.data.preparation.visibility import Surface, points_on_faces
+from sdfhub.data.preparation.visibility import Surface
+from sdfhub.geometry.morton import morton_codes, morton_order
+from sdfhub.geometry.surface_sampling import points_on_faces, random_faces
 from sdfhub.triangles import face_normals
 
 VOTES = 11
 """Neighbours that vote (DeepSDF's code)."""
 VOTERS = 250_000
-"""Visible points that stand for election (DeepSDF's code: half of the samples of a shape)."""
+"""Visible points that may vote (DeepSDF's code: half of the samples of a shape)."""
 INNER = 0.95
-"""Part of the radius of an empty ball within which its centre's winding number speaks for other points."""
+"""Part of the radius of an empty ball within which points take the winding number of its centre."""
 CLEAR = 0.1
-"""Distance of a winding number from a whole one below which it may speak for others."""
+"""Distance of a winding number from a whole one below which other points may take it."""
 ROUGH, CLOSE = 1.0, 2.0
 """Distances, in radii, from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3) and to 0.01."""
 NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
@@ -31,7 +33,7 @@ NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
 
 @dataclass(frozen=True)
 class Nearest:
-    """The surface seen from each point.
+    """The nearest points of a surface.
 
     Args:
         distance: [N] float64, unsigned.
@@ -60,30 +62,6 @@ class Signs:
 SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs]
 
 
-def morton_order(points: np.ndarray) -> np.ndarray:
-    """[N] permutation that sorts points along a Z curve, so that neighbours follow each other."""
-    keys = _morton_codes(points) << 32 | np.arange(len(points))  # as one number, faster than a stable argsort
-    keys.sort()
-    return keys & 0xFFFFFFFF
-
-
-def _spread_bits() -> np.ndarray:
-    """[1024] the bits of each number with two zeros after each."""
-    code = np.arange(1024)
-    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        code = (code | code << shift) & mask
-    return code
-
-
-SPREAD = _spread_bits()
-
-
-def _morton_codes(points: np.ndarray) -> np.ndarray:
-    """[N] int64 position on the Z curve of a 1024^3 grid over [-1.5, 1.5]^3."""
-    cells = ((np.clip(points, -1.5, 1.499) + 1.5) * (1024 / 3)).astype(np.int16)
-    return SPREAD[cells[:, 0]] | SPREAD[cells[:, 1]] << 1 | SPREAD[cells[:, 2]] << 2
-
-
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
     """Exact unsigned distances to all faces, two-sided sheets included.
 
@@ -108,7 +86,7 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
     """
     order = morton_order(points)
     points, distance = points[order], nearest.distance[order]
-    codes, winding, todo = _morton_codes(points), np.empty(len(points)), np.arange(len(points))
+    codes, winding, todo = morton_codes(points), np.empty(len(points)), np.arange(len(points))
     tree = igl.FastWindingNumberBVH()
     tree.init(*cut_long(surface.vertices, surface.solid(), WINDING_EDGE)[:2], 2)
     for level in range(8, 0, -1):  # cells of 3/4 down to 6/1024 a side
@@ -117,8 +95,8 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
         largest, cell = _largest_of_runs(codes[todo] >> 3 * level, distance[todo])
         centre = todo[largest]
         winding[centre] = _winding_numbers(tree, points[centre])
-        speaks = np.abs(winding[centre] - np.round(winding[centre])) < CLEAR
-        reach = np.where(speaks, INNER * distance[centre], 0)[cell]
+        is_clear = np.abs(winding[centre] - np.round(winding[centre])) < CLEAR
+        reach = np.where(is_clear, INNER * distance[centre], 0)[cell]
         apart = points[todo] - points[centre[cell]]
         shared = np.einsum("nj,nj->n", apart, apart) < reach**2
         winding[todo[shared]] = winding[centre[cell[shared]]]
@@ -154,12 +132,10 @@ def vote_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.r
     """
     normals = face_normals(surface.vertices, surface.faces)
     area = np.linalg.norm(normals, axis=1)
-    face = rng.choice(len(area), VOTERS, p=area / area.sum())
+    face = random_faces(area, VOTERS, rng)
     voters = points_on_faces(surface.vertices[surface.faces], face, rng)
-    turned = np.where(
-        surface.two_sided[face] & (rng.random(VOTERS) < 0.5), -1.0, 1.0
-    )  # seen from either side
-    normal = normals[face] * turned[:, None]
+    is_turned = surface.two_sided[face] & (rng.random(VOTERS) < 0.5)  # sheets are seen from either side
+    normal = np.where(is_turned[:, None], -normals[face], normals[face])
     order = morton_order(voters)
     voters, normal = voters[order], normal[order]
     _, near = cKDTree(voters, balanced_tree=False).query(points, VOTES)

@@ -14,12 +14,13 @@ from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.errors import RejectedMesh
+from sdfhub.geometry.sphere import sphere_directions
+from sdfhub.geometry.surface_sampling import points_on_faces
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-os.environ.setdefault(
-    "IGL_NUM_THREADS", "1"
-)  # read by libigl's first call: shapes run in parallel, not points
+# Read by libigl's first call: shapes run in parallel, not points.
+os.environ.setdefault("IGL_NUM_THREADS", "1")
 
 FIRST, SECOND = 16, 48
 """Rays at every face, and at those that the first ones leave open."""
@@ -74,25 +75,6 @@ class Sightings:
     back: np.ndarray
 
 
-def view_directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
-    height = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    radius = np.sqrt(1 - height**2)
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
-
-
-def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """[N, 3] a uniform point on each triangle named in `face`, [N] rows of `corners` [F, 3, 3]."""
-    root = np.sqrt(rng.random(len(face), corners.dtype))
-    third = root * rng.random(len(face), corners.dtype)
-    corner = corners[face]
-    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
-    points += third[:, None] * (corner[:, 2] - corner[:, 0])
-    points += corner[:, 0]
-    return points
-
-
 def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
     """The share of each face's two sides that parallel views from all around see.
 
@@ -100,7 +82,7 @@ def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sig
     many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
     large ones more often; a second looks again at those that the first leaves open.
     """
-    watch = _Watch(mesh, rng.permutation(view_directions(views)), rng)
+    watch = _Watch(mesh, rng.permutation(sphere_directions(views)), rng)
     large = (watch.area / watch.area.sum() * LARGE).astype(np.int64)
     watch.look(np.arange(len(large)), large + _fair(len(large), FIRST))
     again = np.flatnonzero(_is_open(*watch.sums))
@@ -179,9 +161,8 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
     two_sided = kept & (wrong > preparation.two_sided_above * total)
     two_sided[two_sided] = ~_bounds_a_solid(mesh.vertices, faces[kept], faces[two_sided])
     if not (kept & ~two_sided).any():
-        raise RejectedMesh(
-            "two_sided_area", "no visible face has a single visible side, so nothing has an inside"
-        )
+        what = "no visible face has a single visible side, so nothing has an inside"
+        raise RejectedMesh("two_sided_area", what)
     visible = np.where(kept, area, 0)
     statistics = {
         "hidden_area": float(area[~kept].sum() / area.sum()),
@@ -220,9 +201,8 @@ def closed_surface(mesh: NormalizedMesh) -> Surface | None:
     backward.sort()
     if (np.diff(forward) == 0).any() or not np.array_equal(forward, backward):
         return None  # an edge without exactly two faces, or two faces that run along it the same way
-    volume = (
-        np.einsum("nj,nj->", mesh.vertices[mesh.faces[:, 0]], face_normals(mesh.vertices, mesh.faces)) / 6
-    )
+    normals = face_normals(mesh.vertices, mesh.faces)
+    volume = np.einsum("nj,nj->", mesh.vertices[mesh.faces[:, 0]], normals) / 6
     if volume <= 0 or piece_count(mesh.faces, len(mesh.vertices)) > 1:
         return None
     return Surface(mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), bool), {"fast_path": 1.0})

@@ -20,7 +20,7 @@ from sdfhub.data.sources.source import (
 )
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import RejectedMesh, SdfhubError
-from sdfhub.shapes import ShapeSamples
+from sdfhub.shapes import Frame, ShapeSamples
 
 MAX_BYTES = 1 << 30
 """Of one array; DeepSDF's have some 8 MB."""
@@ -130,7 +130,9 @@ def read_samples(path: Path) -> ShapeSamples:
     center, scale = frame_of(path) or (np.zeros(3), 1.0)
     none = np.zeros((0, 3), dtype=np.float32)
     statistics = {"inside": len(negative) / len(rows)}
-    return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, center, scale, None, statistics)
+    return ShapeSamples(
+        rows[:, :3].copy(), rows[:, 3].copy(), none, none, Frame(center, scale), None, statistics
+    )
 
 
 def _rows(path: Path, name: str) -> np.ndarray:

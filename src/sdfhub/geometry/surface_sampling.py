@@ -1,0 +1,52 @@
+"""Random points on a triangle mesh, uniform by area."""
+
+import numpy as np
+
+from sdfhub.triangles import face_normals
+
+
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, seed: int | tuple[int, ...] | np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Independent points on a mesh, uniform by area, those of a face together.
+
+    Args:
+        vertices: [V, 3], any frame.
+        faces: [F, 3] rows of `vertices`.
+        count: n, the number of points.
+        seed: of the generator, or the generator itself.
+
+    Returns:
+        points [n, 3] float64, and the unit normals [n, 3] float64 of their faces, outward as the faces are.
+
+    Raises:
+        ValueError: the mesh has no area.
+    """
+    rng = np.random.default_rng(seed)
+    normals = face_normals(vertices, faces)
+    area = np.linalg.norm(normals, axis=1)
+    face = random_faces(area, count, rng)
+    return points_on_faces(vertices[faces], face, rng), normals[face] / area[face, None]
+
+
+def random_faces(area: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count] rows of faces in ascending order, each drawn in proportion to its area of [F].
+
+    Raises:
+        ValueError: there is no area.
+    """
+    total = area.sum()
+    if not total > 0:
+        raise ValueError("faces: the mesh has no area to sample")
+    return np.repeat(np.arange(len(area)), rng.multinomial(count, area / total))
+
+
+def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """[N, 3] a uniform point on each triangle named in `face`, [N] rows of `corners` [F, 3, 3]."""
+    root = np.sqrt(rng.random(len(face), corners.dtype))
+    third = root * rng.random(len(face), corners.dtype)
+    corner = corners[face]
+    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
+    points += third[:, None] * (corner[:, 2] - corner[:, 0])
+    points += corner[:, 0]
+    return points
