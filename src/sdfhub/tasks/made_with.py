@@ -2,12 +2,11 @@
 
 import platform
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import torch
 from lightning.pytorch import Trainer
-
-from sdfhub.report.origin import installed_version
 
 PACKAGES = ("sdfhub", "torch", "lightning", "numpy")
 
@@ -17,7 +16,7 @@ def made_with(trainer: Trainer) -> dict[str, str]:
     device = trainer.strategy.root_device
     return {
         "python": ".".join(map(str, sys.version_info[:3])),
-        **{name: installed_version(name) for name in PACKAGES},
+        **{name: version(name) for name in PACKAGES},
         "system": f"{platform.system()} {platform.machine()}",
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
         "threads": str(torch.get_num_threads()),
