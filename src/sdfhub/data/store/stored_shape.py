@@ -188,7 +188,7 @@ class StoredShape:
         if "faces" not in self._rows:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
-        return NormalizedMesh(vertices, faces, self.center, self.scale)
+        return NormalizedMesh(vertices, faces, Frame(self.center, self.scale))
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
