@@ -142,7 +142,7 @@ class AutoDecoder(L.LightningModule):
         """Scores one shape of `val_dataloader`: `val/...` of held-out shapes, `train/...` of known ones."""
         if self.validation is None:
             return
-        scores = self.validation(self.decoder, self.codes.table.detach(), shape, self.loss.delta)
+        scores = self.validation(self.decoder, shape, self.codes.table)
         role = "val" if shape.role == "held_out" else "train"
         named = {f"{role}/{name}": value for name, value in scores.items()}
         self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
