@@ -144,7 +144,6 @@ MISTAKES = {
     "activation.betta=3": ["betta", "did you mean 'activation.beta'"],
     "activation.sharpness=3": ["sharpness", "activation.omega_0, activation.omega_hidden", "activation.beta"],
     "+foo=3": ["foo"],
-    "fit.steps=3": ["no key 'fit.steps'", "evaluate.fit.steps"],
     "scale.omega=3": ["no key 'scale.omega'", "did you mean 'scale.omega_0'"],
     "hydra.launcher.n_jobs=4": ["no key 'hydra.launcher.n_jobs'; add hydra/launcher=joblib, which has it"],
     "hydra.launcher.n_job=4": ["did you mean 'hydra.launcher.n_jobs' of hydra/launcher=joblib?"],
@@ -224,7 +223,7 @@ def test_what_a_run_decides_of_its_trainer_is_no_setting(name, tmp_path):
 
 def test_codes_are_fitted_under_the_clamp_of_the_training(tmp_path):
     config = composed("loss.delta=0.05", "fit=deepsdf")
-    assert train_task.build_parts(config, tmp_path).evaluation.fit.delta == 0.05
+    assert train_task.build_parts(config, tmp_path).evaluation.delta == 0.05
 
 
 def test_ctrl_c_is_status_130(monkeypatch, tmp_path):

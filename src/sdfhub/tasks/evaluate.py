@@ -4,7 +4,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.loading.batches import draw_rows, signed_samples
+from sdfhub.data.loading.batches import draw_rows
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store.shards import StoredShape
@@ -26,6 +25,7 @@ from sdfhub.geometry.metrics import Judge
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
+from sdfhub.scans.observed_scan import observations_of
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.space import reconstruct
 from sdfhub.tasks.app import run_task
@@ -57,6 +57,7 @@ class Evaluation:
         pictures: shapes of each role on the contact sheet.
         workers: processes that judge, >= 0; None for one per core.
         seed: of every draw.
+        delta: clamp of distances in the training; codes are fitted under the same.
     """
 
     resolution: int
@@ -68,6 +69,7 @@ class Evaluation:
     pictures: int
     workers: int | None = None
     seed: int = 0
+    delta: float = 0.1
 
     def __post_init__(self):
         if self.resolution < 2 or min(self.points, self.fit_together) < 1:
@@ -87,7 +89,7 @@ def build_evaluation(node: dict[str, Any], loss: dict[str, Any]) -> Evaluation:
         SdfhubError: a setting is wrong.
     """
     delta = check(loss["delta"], float, "loss.delta")
-    return build(node | {"fit": node["fit"] | {"delta": delta}}, "evaluate")
+    return build(node, "evaluate", delta=delta)
 
 
 def evaluate_model(
@@ -119,34 +121,28 @@ def evaluate_model(
     known, unseen = list(train.items())[: evaluation.known], list(held_out)[: evaluation.held_out]
     roles = [("known", shape, codes[row]) for row, shape in known]
     if unseen:
-        fitted = fit_held_out(decoder, unseen, evaluation)
+        fitted = fit_held_out(decoder, codes, unseen, evaluation)
         roles += [("held_out", shape, code) for shape, code in zip(unseen, fitted, strict=True)]
     if any(shape.mesh is None for _, shape, _ in roles):
-        delta = evaluation.fit.delta
-        rows = [(role, shape, distance_errors(decoder, code, shape, delta)) for role, shape, code in roles]
+        rows = [
+            (role, shape, distance_errors(decoder, code, shape, evaluation.delta))
+            for role, shape, code in roles
+        ]
         return write_distances(rows, training, out)
     return write_scores(judge_all(decoder, roles, evaluation, out), evaluation, training, out)
 
 
-def fit_held_out(decoder: Decoder, shapes: Sequence[StoredShape], evaluation: Evaluation) -> Tensor:
-    """Codes [S, L] of shapes that were never trained on, from their signed samples."""
+def fit_held_out(
+    decoder: Decoder, codes: Tensor, shapes: Sequence[StoredShape], evaluation: Evaluation
+) -> Tensor:
+    """Codes [B, L] of unseen shapes, from their signed samples; codes [S, L] are of the training shapes."""
     fitted = []
     for start in range(0, len(shapes), evaluation.fit_together):
         group = list(shapes[start : start + evaluation.fit_together])
         seeds = [shape_seed(shape) ^ evaluation.seed for shape in group]
-        draw = partial(_drawn, group, seeds, evaluation.fit.samples)
-        fitted.append(evaluation.fit(decoder, draw, seeds))
+        observations = observations_of(group, evaluation.fit.samples, seeds)
+        fitted.append(evaluation.fit(decoder, codes, observations, evaluation.delta).codes)
     return torch.cat(fitted)
-
-
-def _drawn(shapes: list[StoredShape], seeds: list[int], samples: int, step: int) -> tuple[Tensor, Tensor]:
-    """A step's points [B, N, 3] and distances [B, N]; a shape's draw depends on its own seed alone."""
-    rows = [
-        signed_samples(shape, samples, np.random.default_rng((seed, step)))
-        for shape, seed in zip(shapes, seeds, strict=True)
-    ]
-    drawn = torch.from_numpy(np.stack(rows))
-    return drawn[..., :3], drawn[..., 3]
 
 
 def judge_all(

@@ -8,6 +8,7 @@ from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery
 from sdfhub.tasks.opening import beside, load
+from sdfhub.tasks.words import take_words
 
 
 def interpolate(config: dict[str, Any]) -> None:
@@ -25,7 +26,8 @@ def interpolate(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub interpolate run=RUN a=ID b=ID steps=8`."""
+    """Console entry: `sdfhub interpolate RUN A B steps=8`."""
+    take_words("run", "a", "b")
 
     def task(config: DictConfig) -> None:
         interpolate(plain(config))

@@ -11,19 +11,15 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
-from sdfhub.latent.reconstruction import Method
 from sdfhub.model.decoder import Decoder
-from sdfhub.scans.evidence import Evidence
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
-from sdfhub.tasks.build import build, check
-from sdfhub.tasks.conf_files import configuration_folder
+from sdfhub.tasks.build import check
 from sdfhub.tasks.run import build_decoder, plain_frames, put_weights, read_run, read_weights
 from sdfhub.whole_file import write_whole
 
@@ -52,7 +48,6 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
     where = _device(device)
     try:
         about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
-        evidence, method = default_fitting(clamp(about["config"]))
         ids = tuple(about["ids"])
         frames = about["frames"].items()
         return Space(
@@ -63,8 +58,7 @@ def load(path: str | Path, device: str | torch.device | None = None) -> Space:
             up=about["up"],
             config=about["config"],
             metrics=about["metrics"],
-            evidence=evidence,
-            method=method,
+            delta=clamp(about["config"]),
         )
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise SdfhubError(f"{path}: not a shape space that this version reads: {error}") from error
@@ -102,22 +96,6 @@ def trained_decoder(node: Mapping[str, Any], weights: Mapping[str, Tensor], path
 def clamp(config: Mapping[str, Any]) -> float:
     """delta, within which a run learned distances, as its config says; codes are fitted under the same."""
     return check(config["loss"]["delta"], float, "loss.delta")
-
-
-def default_fitting(delta: float) -> tuple[Evidence, Method]:
-    """What `sdfhub reconstruct` takes by default: the evidence of a scan, and the method.
-
-    Args:
-        delta: clamp of distances.
-    """
-    evidence, method, prior = (
-        yaml.safe_load((configuration_folder() / file).read_text(encoding="utf-8"))
-        for file in ("reconstruct.yaml", "method/map.yaml", "prior/gaussian.yaml")
-    )
-    return (
-        build(evidence["evidence"], "evidence", within="sdfhub.scans"),
-        build(method | {"prior": prior, "delta": delta}, "method", within="sdfhub.latent"),
-    )
 
 
 def beside(run: str, out: str | None, name: str) -> Path:

@@ -8,6 +8,7 @@ from sdfhub.tasks.app import run_task
 from sdfhub.tasks.build import Seed, check, plain
 from sdfhub.tasks.gallery import write_gallery
 from sdfhub.tasks.opening import beside, load
+from sdfhub.tasks.words import take_words
 
 
 def sample(config: dict[str, Any]) -> None:
@@ -25,7 +26,8 @@ def sample(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub sample run=RUN n=8`."""
+    """Console entry: `sdfhub sample RUN n=8`."""
+    take_words("run")
 
     def task(config: DictConfig) -> None:
         sample(plain(config))
