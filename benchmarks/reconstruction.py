@@ -28,6 +28,9 @@ from hydra import compose, initialize_config_dir
 from runs import at_least, run_benchmark
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from sdfhub.scans.target import Target, observed
+from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
+from sdfhub.tasks.reconstructor import Found, Reconstructor
 
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import Split, split
@@ -39,14 +42,11 @@ from sdfhub.geometry.metrics import judge, point_to_surface
 from sdfhub.geometry.render import render
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.scans.scan import Scan
-from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
-from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
 from sdfhub.tasks.conf_files import configuration_folder
 from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.reconstruct import limits_of, reconstructor
-from sdfhub.tasks.reconstructor import Found, Reconstructor
 from sdfhub.tasks.run import read_run
 
 KINDS = {

@@ -39,8 +39,8 @@ TINY = [
     "normals.points=32",
     "evaluate.resolution=48",
     "evaluate.points=2000",
-    "evaluate.fit.steps=20",
-    "evaluate.fit.samples=500",
+    "fit.steps=20",
+    "fit.samples=500",
 ]
 
 
@@ -147,7 +147,7 @@ def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shape
         "evaluate=fast",
         "evaluate.resolution=40",
         "evaluate.points=2000",
-        "evaluate.fit.steps=10",
+        "fit.steps=10",
         "held_out=2",
         "data.store=" + str(folder.parents[2] / "store"),
     )
@@ -162,7 +162,7 @@ def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shape
 def test_a_held_out_score_does_not_depend_on_the_shapes_beside_it(trained, tmp_path):
     folder, _ = trained
     few = ["evaluate=fast", "evaluate.resolution=32", "evaluate.points=1000", "evaluate.known=0"]
-    few += ["evaluate.fit.steps=15", "evaluate.fit.samples=400", f"run={folder}"]
+    few += ["fit.steps=15", "fit.samples=400", f"run={folder}"]
     scores = []
     for count in (1, 3):
         config = composed(*few, f"held_out={count}", f"out={tmp_path / str(count)}", config_name="evaluate")

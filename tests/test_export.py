@@ -180,7 +180,7 @@ def test_help_is_the_tasks_own_keys_and_what_they_mean(task, monkeypatch, capsys
 
 def test_help_tells_the_groups_of_a_task_and_no_others(monkeypatch, capsys):
     printed = told(monkeypatch, capsys, reconstruct, "--help")
-    assert "method: map # one of deepsdf, map" in printed and "\n  nearest: 3 " in printed
+    assert "fit: gauss_newton # one of deepsdf, gauss_newton" in printed and "\n  nearest: 3 " in printed
     assert "sensor: null # " in printed
     assert not {"activation:", "_target_", "hydra"} & set(printed.lower().split())
 

@@ -7,11 +7,9 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
-from sdfhub.latent.fitting import GaussNewtonFit
 from sdfhub.model.activations import Hosc, Relu, Siren
 from sdfhub.model.fast.computing import Computing, distances
 from sdfhub.model.fast.dropout import drawn_from, kept
@@ -19,7 +17,6 @@ from sdfhub.model.fast.loops import ALONE
 from sdfhub.model.fast.side_by_side import _pool, side_by_side
 from sdfhub.tasks.run import build_autodecoder
 from tests.test_config import composed
-from tests.test_fitting import NEWTON, draws
 from tests.test_model import small_decoder
 from tests.test_training import batches
 
@@ -220,13 +217,3 @@ def test_distances_in_parts_are_those_of_the_decoder(shapes, count, several):
     points, codes = torch.rand(shapes, count, 3) - 0.5, torch.randn(shapes, 4)
     with torch.no_grad():
         torch.testing.assert_close(distances(decoder, points, codes), decoder(points, codes))
-
-
-def test_shapes_fitted_side_by_side_have_the_codes_that_each_has_alone(several):
-    torch.manual_seed(0)
-    decoder, fit = small_decoder(width=32), GaussNewtonFit(**NEWTON)
-    radii = np.linspace(0.4, 0.55, 5)
-    together = fit(decoder, draws(*radii), range(5))
-    each = [fit(decoder, draws(radius), [seed]) for seed, radius in enumerate(radii)]
-    assert torch.equal(together, torch.cat(each))
-    assert torch.equal(together, alone(lambda: fit(decoder, draws(*radii), range(5))))

@@ -227,7 +227,7 @@ def cloud_file() -> bytes:
 def test_a_mesh_or_cloud_is_fitted_as_the_space_fits_it_in_its_own_frame(space, name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     code, surface = fit_scan(space, name, content)
-    torch.testing.assert_close(code, space.fit_scan(read_scan(tmp_path / name), "shape"))
+    torch.testing.assert_close(code, space.fit_scan(read_scan(tmp_path / name)))
     assert len(surface) <= 4000 and surface.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(surface, axis=1), 1 / 1.03, atol=0.01)
 

@@ -68,6 +68,7 @@ def load(
             frames={id: Frame(np.array(four[:3], np.float64), float(four[3])) for id, four in frames},
             up=about["up"],
             model=about["model"],
+            delta=float(about["model"]["loss"]["delta"]),
             config=about["config"],
             metrics=about["metrics"],
         )

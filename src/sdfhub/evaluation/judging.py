@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from sdfhub.data.loading.batches import draw_rows
+from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.evaluation.scoresheet import (
@@ -28,6 +29,7 @@ from sdfhub.geometry.metrics import Judge
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
+from sdfhub.scans.observed_scan import observations_of
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.space import reconstruct
 
@@ -119,8 +121,9 @@ def fit_held_out(
     fitted = []
     for start in range(0, len(shapes), evaluation.fit_together):
         group = shapes[start : start + evaluation.fit_together]
-        observed = [observation(shape, evaluation.fit.samples, evaluation.seed) for shape in group]
-        fitted.append(evaluation.fit(decoder, codes, observed, delta).codes)
+        seeds = [shape_seed(shape) ^ evaluation.seed for shape in group]
+        observations = observations_of(group, evaluation.fit.samples, seeds)
+        fitted.append(evaluation.fit(decoder, codes, observations, delta).codes)
     return torch.cat(fitted)
 
 

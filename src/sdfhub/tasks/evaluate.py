@@ -39,7 +39,7 @@ def evaluate_run(config: DictConfig) -> dict[str, Any]:
     shapes, held_out = data.prepared(roles)
     train = {roles_then["train"].index(shape.id): shape for shape in shapes}
     delta = space.model["loss"]["delta"]
-    return evaluate_model(space.decoder, space.codes, delta, train, held_out, evaluation, out)
+    return evaluate_model(space.decoder, space.codes, space.delta, train, held_out, evaluation, out)
 
 
 def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:

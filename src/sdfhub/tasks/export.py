@@ -17,8 +17,10 @@ from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import FORMATS, write_mesh
 from sdfhub.model.decoder import Decoder
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import beside, load, write_space
+from sdfhub.composition import plain
+from sdfhub.described import check
+from sdfhub.opening import beside, load, write_space
+from sdfhub.tasks.words import take_words
 from sdfhub.whole_file import write_whole
 
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
@@ -120,7 +122,8 @@ def _quiet() -> Iterator[None]:
 
 
 def main() -> None:
-    """Console entry: `sdfhub export run=RUN to=safetensors`."""
+    """Console entry: `sdfhub export RUN TO`."""
+    take_words("run", "to")
 
     def task(config: DictConfig) -> None:
         export(plain(config))

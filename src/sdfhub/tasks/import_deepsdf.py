@@ -24,10 +24,12 @@ from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shap
 from sdfhub.data.sources.split_file import names_listed
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import first_word_as, run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import load, trained_decoder
+from sdfhub.tasks.app import run_task
+from sdfhub.composition import plain
+from sdfhub.described import check
+from sdfhub.opening import load, trained_decoder
 from sdfhub.tasks.run import begin_run
+from sdfhub.tasks.words import take_words
 
 OWN_KEYS = ("folder", "epoch", "split", "out")
 """Keys of the task's config that are no part of a training's."""
@@ -237,7 +239,7 @@ def known_frames(root: Path, name_of: Mapping[str, str]) -> dict[str, Frame]:
 
 def main() -> None:
     """Console entry: `sdfhub import-deepsdf EXPERIMENT_DIR`."""
-    first_word_as("folder")
+    take_words("folder")
 
     def task(config: DictConfig) -> None:
         import_deepsdf(plain(config))

@@ -5,9 +5,11 @@ from typing import Any
 from omegaconf import DictConfig
 
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
+from sdfhub.composition import plain
+from sdfhub.described import check
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
+from sdfhub.opening import beside, load
+from sdfhub.tasks.words import take_words
 
 
 def interpolate(config: dict[str, Any]) -> None:
@@ -25,7 +27,8 @@ def interpolate(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub interpolate run=RUN a=ID b=ID steps=8`."""
+    """Console entry: `sdfhub interpolate RUN A B steps=8`."""
+    take_words("run", "a", "b")
 
     def task(config: DictConfig) -> None:
         interpolate(plain(config))

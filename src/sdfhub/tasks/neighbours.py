@@ -8,9 +8,11 @@ from omegaconf import DictConfig
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.scan import read_scan
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
+from sdfhub.composition import plain
+from sdfhub.described import check
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
+from sdfhub.opening import beside, load
+from sdfhub.tasks.words import take_words
 
 
 def neighbours(config: dict[str, Any]) -> None:
@@ -23,7 +25,7 @@ def neighbours(config: dict[str, Any]) -> None:
         of, scan = Path(str(shape)).name, read_scan(Path(str(shape)))
         if scan.kind == "view":
             raise SdfhubError(f"of={shape}: is a single view; see `sdfhub reconstruct`, which takes such")
-        shape = space.fit_scan(scan, "shape")
+        shape = space.fit_scan(scan)
     else:
         of = space.ids[space.row(shape)]
     found = space.neighbours(shape, check(config["k"], int, "k"))
@@ -35,7 +37,8 @@ def neighbours(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub neighbours run=RUN of=ID k=7`."""
+    """Console entry: `sdfhub neighbours RUN OF k=7`."""
+    take_words("run", "of")
 
     def task(config: DictConfig) -> None:
         neighbours(plain(config))

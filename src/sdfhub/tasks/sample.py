@@ -5,9 +5,11 @@ from typing import Any
 from omegaconf import DictConfig
 
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import Seed, check, plain
+from sdfhub.composition import plain
+from sdfhub.described import check
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
+from sdfhub.opening import beside, load
+from sdfhub.tasks.words import take_words
 
 
 def sample(config: dict[str, Any]) -> None:
@@ -25,7 +27,8 @@ def sample(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub sample run=RUN n=8`."""
+    """Console entry: `sdfhub sample RUN n=8`."""
+    take_words("run")
 
     def task(config: DictConfig) -> None:
         sample(plain(config))

@@ -9,8 +9,10 @@ from pydantic import Field
 
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import load
+from sdfhub.composition import plain
+from sdfhub.described import check
+from sdfhub.opening import load
+from sdfhub.tasks.words import take_words
 
 
 def view(config: dict[str, Any]) -> None:
@@ -32,7 +34,8 @@ def view(config: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Console entry: `sdfhub view run=RUN`."""
+    """Console entry: `sdfhub view RUN`."""
+    take_words("run")
 
     def task(config: DictConfig) -> None:
         view(plain(config))
