@@ -78,10 +78,10 @@ def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> A
     if isinstance(make, nn.Module):
         made = copy.deepcopy(make)
     else:
-        arguments = inspect.signature(make).parameters.values()
-        takes_first = any(
-            argument.name == "first" or argument.kind == argument.VAR_KEYWORD for argument in arguments
-        )
+        arguments = inspect.signature(make).parameters
+        kind = getattr(make, "func", make)
+        is_ours = isinstance(kind, type) and issubclass(kind, Activation)  # every module takes **kwargs
+        takes_first = "first" in arguments or (is_ours and "kwargs" in arguments)
         made = make(first=first) if takes_first else make()
     if not isinstance(made, nn.Module):
         raise ValueError(f"activation must make a torch.nn.Module, got {type(made).__name__}")
