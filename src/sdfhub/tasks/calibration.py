@@ -15,8 +15,8 @@ import numpy as np
 
 from sdfhub.data.loading import SdfDataModule
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import BOUNDS, Evidence
 from sdfhub.scans.scan import LEAST, Scan

@@ -18,8 +18,8 @@ from sdfhub.data.loading import SdfDataModule
 from sdfhub.data.loading.batches import draw_rows, signed_samples
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
-from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh
