@@ -101,7 +101,7 @@ def imported_at_start(module: str) -> set[str]:
 def test_a_training_starts_without(slow):
     """Hydra imports the callback of sweeps whenever it starts."""
     found = imported_at_start("sdfhub.tasks.train") | imported_at_start("sdfhub.tasks.sweep")
-    assert {"torch", "sdfhub.data.store.store", "sdfhub.tasks.prepare"} <= found
+    assert {"torch", "sdfhub.data.store.store", "sdfhub.data.loading"} <= found
     assert slow not in found
 
 

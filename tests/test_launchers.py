@@ -14,7 +14,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.report.results import read_sweep
 from sdfhub.tasks import sweep as sweeps
 from sdfhub.tasks import train as train_task
-from sdfhub.tasks.prepare import prepare_part
+from sdfhub.tasks.prepare import prepare
 from tests.test_config import CONF, composed
 
 ROOT = Path(__file__).parents[1]
@@ -66,8 +66,7 @@ def test_a_part_is_prepared_and_a_mistake_in_a_worker_is_one_line(prepared, root
     assert "part 1/2: 2 shapes, 2 of them prepared now" in prepared.stdout
     assert prepared.stderr.strip().splitlines()[-1].startswith("sdfhub: error: part=3/2: must be i/n")
     assert "Traceback" not in prepared.stderr and "Warning" not in prepared.stderr
-    assert len(list((root / "store").glob("*/*/*/*/shape.json"))) == 2
-    assert not list((root / "store").glob("*/*/manifest.json")), "a part leaves the manifest alone"
+    assert len(list((root / "store").glob("*/*/*/*.safetensors"))) == 2
 
 
 @needs("hydra_joblib_launcher")
@@ -81,8 +80,8 @@ def test_a_failing_cell_stops_no_other_under_submitit(launched, root):
     assert [cell.state for cell in read_sweep(sweep)] == ["done", "failed"]
     logs = "".join(path.read_text() for path in sweep.glob(".submitit/*/*.out"))
     assert "3 shapes kept" in logs
-    (manifest,) = (root / "store").glob("*/*/manifest.json")
-    assert len(Store.open(manifest.parent)) == 3
+    (index,) = (root / "store").glob("*/*/index.json")
+    assert len(Store.open(index.parent)) == 3
 
 
 @needs("hydra_joblib_launcher")
@@ -131,7 +130,7 @@ def composed_launcher(launcher: str) -> dict:
 @pytest.mark.parametrize("part", ["0/2", "3/2", "2", "a/b", "1/0"])
 def test_a_part_that_cannot_be_is_refused(part):
     with pytest.raises(SdfhubError, match="must be i/n"):
-        prepare_part(composed()["data"], part)
+        prepare(composed() | {"part": part})
 
 
 def test_the_processes_that_slurm_starts_for_ddp_train_one_cell_together(root, places):

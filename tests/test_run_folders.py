@@ -8,6 +8,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 
+from sdfhub.data.loading import SdfDataModule
 from sdfhub.errors import SdfhubError
 from sdfhub.tasks import evaluate as evaluate_task
 from sdfhub.tasks.app import register_resolvers
@@ -69,7 +70,7 @@ def test_results_that_could_not_be_written_are_told_before_the_evaluation(tmp_pa
     with (
         patch.object(evaluate_task, "read_run", lambda run: (trained, {"train": [], "held_out": []})),
         patch.object(evaluate_task, "load", lambda run: None),
-        patch.object(evaluate_task, "prepare_split", lambda *_: pytest.fail("prepared")),
+        patch.object(SdfDataModule, "prepared", lambda *_: pytest.fail("prepared")),
         pytest.raises(SdfhubError, match="out: cannot be written"),
     ):
         evaluate_run(config)

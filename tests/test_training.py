@@ -158,8 +158,8 @@ def test_an_epoch_goes_on_where_the_last_ended():
     done = 8
     steps = EpochSteps(4, done=lambda: done)
     assert list(steps) == [8, 9, 10, 11]
-    done = 10  # a run stopped in the middle of an epoch does the rest of it
-    assert list(steps) == [10, 11] and len(steps) == 4
+    done = 10  # stopped in the middle of an epoch: the trainer ends it
+    assert list(steps) == [10, 11, 12, 13] and len(steps) == 4
 
 
 def test_augmented_copies_are_exact_signed_distances_of_similar_shapes():

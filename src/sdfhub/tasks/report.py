@@ -8,8 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import Store, preparation_hash
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.report.meshes import FindTruth

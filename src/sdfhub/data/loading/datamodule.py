@@ -123,9 +123,11 @@ class SdfDataModule(L.LightningDataModule):
         return roles
 
     def prepared(self, roles: Split) -> tuple[list[StoredShape], list[StoredShape]]:
-        """The stored shapes of both roles; those that the store lacks are prepared, rejected ones left out."""
+        """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
         store = self.filled(roles)
-        train, held_out = ([store[s.id] for s in part if s.id in store] for part in (roles.train, roles.held_out))
+        train, held_out = (
+            [store[s.id] for s in part if s.id in store] for part in (roles.train, roles.held_out)
+        )
         asked = len(roles.train) + len(roles.held_out)
         rejected = f" ({_counted(asked)} asked for, {len(store.rejected)} rejected)" if store.rejected else ""
         name = self.source.name

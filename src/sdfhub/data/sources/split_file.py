@@ -18,8 +18,8 @@ def with_roles(
     """The shapes that split files list, with their roles; all of them, without roles, where no file is given.
 
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
-    of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A name is the path
-    of a shape's file, or its last parts, without the suffix.
+    of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
+    name is the path of a shape's file, or its last parts, without the suffix.
 
     Args:
         shapes: each with its path below the source's root, without suffix.

@@ -227,7 +227,7 @@ class StoredShape:
             return False
 
     def _open(self) -> BinaryIO:
-        return open(self.path, "rb", opener=_without_links)  # noqa: SIM115 - the callers close it
+        return open(self.path, "rb", opener=_without_links)
 
     def _map(self, name: str) -> np.ndarray:
         shape = (self.rows(name), COLUMNS[name])
