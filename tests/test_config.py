@@ -28,7 +28,11 @@ CHOICES = [(group, choice) for group, choice in ALL_CHOICES if group not in (*OT
 def composed(*overrides: str, config_name: str = "config"):
     register_resolvers()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        where = [] if any("runtime.output_dir" in word for word in overrides) else ["hydra.runtime.output_dir=here"]
+        where = (
+            []
+            if any("runtime.output_dir" in word for word in overrides)
+            else ["hydra.runtime.output_dir=here"]
+        )
         config = compose(config_name, [*overrides, *where], return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     OmegaConf.set_struct(config, False)

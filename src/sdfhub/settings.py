@@ -4,7 +4,15 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers", "logger.")
+WHERE_NOT_WHAT = (
+    "ckpt_path",
+    "output_root",
+    "callbacks.",
+    "checkpoint.",
+    "data.store",
+    "data.workers",
+    "logger.",
+)
 WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
 WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile", "computing.tinycudann")
 WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
