@@ -1,4 +1,4 @@
-"""A training of balls that takes milliseconds: what callbacks, loggers and the validation see of a real one."""
+"""A training of balls in milliseconds: what callbacks, loggers and the validation see of a real one."""
 
 from typing import NamedTuple
 

@@ -19,7 +19,12 @@ from sdfhub.callbacks.meshes_and_slices import MeshShapes, Slices
 from tests.ball_training import trained
 from tests.test_config import CONF, composed
 
-NAMES = ["balls/0.4/truth", "balls/0.4/reconstruction", "balls/0.4/truth_and_reconstruction", "balls/0.4/slice_x0"]
+NAMES = [
+    "balls/0.4/truth",
+    "balls/0.4/reconstruction",
+    "balls/0.4/truth_and_reconstruction",
+    "balls/0.4/slice_x0",
+]
 POLE = trimesh.creation.cylinder(0.1, 1.0)
 """Stands along z."""
 
@@ -47,7 +52,9 @@ def events(folder: Path) -> EventAccumulator:
 
 
 def test_every_choice_of_the_group_has_named_parts():
-    named = {path.stem: composed(f"logger={path.stem}")["logger"] for path in (CONF / "logger").glob("*.yaml")}
+    named = {
+        path.stem: composed(f"logger={path.stem}")["logger"] for path in (CONF / "logger").glob("*.yaml")
+    }
     assert {name: set(parts) for name, parts in named.items()} == {
         **{name: {name} for name in ("tensorboard", "csv", "wandb", "mlflow")},
         "many": {"tensorboard", "csv"},
@@ -65,14 +72,19 @@ def test_many_loggers_are_all_served(tmp_path):
     rows = list(csv.DictReader((folder / "metrics.csv").open()))
     assert [row["step"] for row in rows if row["val/cd"]] == ["5", "11"]
     assert [row["step"] for row in rows if row["mesh/cd"]] == ["6", "12"]
-    for name, last in zip(NAMES, ["00000000.glb", "00000012.glb", "00000012.png", "00000012.png"], strict=True):
+    for name, last in zip(
+        NAMES, ["00000000.glb", "00000012.glb", "00000012.png", "00000012.png"], strict=True
+    ):
         assert max(path.name for path in (folder / name).iterdir()) == last
 
 
 def test_csv_files_of_a_continued_training_stand_beside_those_of_the_first(tmp_path):
     for _ in range(2):
         trained(logger=of_group("csv", tmp_path), max_epochs=1)
-    assert sorted(path.parent.name for path in tmp_path.glob("csv/*/metrics.csv")) == ["version_0", "version_1"]
+    assert sorted(path.parent.name for path in tmp_path.glob("csv/*/metrics.csv")) == [
+        "version_0",
+        "version_1",
+    ]
 
 
 def test_no_logger_is_no_error(tmp_path):
@@ -99,7 +111,9 @@ def test_tensorboard_gets_no_more_vertices_than_it_can_draw(tmp_path):
     show_mesh(logger := TensorBoardLogger(tmp_path), "ball", np.array(ball.vertices), ball.faces, "y", 0)
     logger.experiment.flush()
     board = events(Path(logger.log_dir))
-    sizes = {tag: make_ndarray(board.Tensors(tag)[0].tensor_proto).shape[1] for tag in board.Tags()["tensors"]}
+    sizes = {
+        tag: make_ndarray(board.Tensors(tag)[0].tensor_proto).shape[1] for tag in board.Tags()["tensors"]
+    }
     assert 30_000 < min(sizes.values()) <= 60_100, sizes
 
 

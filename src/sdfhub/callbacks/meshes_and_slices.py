@@ -76,7 +76,7 @@ class MeshShapes(ShapesShown):
         if points < 1 or resolution < 2:
             raise ValueError(f"points={points}, resolution={resolution}: must be at least 1 and 2")
         self.resolution, self.points = resolution, points
-        self._truth_shown: set[str] = set()
+        self._truth_pictures: dict[str, np.ndarray] = {}  # of the shapes whose true mesh was shown
 
     def show(self, trainer: L.Trainer, module: AutoDecoder, shapes: list[StoredShape]) -> None:
         rows = [row for row, shape in enumerate(shapes) if shape.mesh is not None]
@@ -90,14 +90,15 @@ class MeshShapes(ShapesShown):
 
     def _show_shape(self, trainer, module: AutoDecoder, row: int, shape: StoredShape) -> ShapeMetrics:
         mesh, truth, step = self._mesh(module, row), shape.mesh, trainer.global_step
-        sides = [render(*side, up=shape.up) for side in ((truth.vertices, truth.faces), mesh)]
-        for logger in trainer.loggers:
-            if shape.id not in self._truth_shown:
+        if shape.id not in self._truth_pictures:
+            self._truth_pictures[shape.id] = render(truth.vertices, truth.faces, up=shape.up)
+            for logger in trainer.loggers:
                 show_mesh(logger, f"{shape.id}/truth", truth.vertices, truth.faces, shape.up, 0)
+        pair = np.hstack([self._truth_pictures[shape.id], render(*mesh, up=shape.up)])
+        for logger in trainer.loggers:
             if len(mesh[1]):
                 show_mesh(logger, f"{shape.id}/reconstruction", *mesh, shape.up, step)
-            show_picture(logger, f"{shape.id}/truth_and_reconstruction", np.hstack(sides), step)
-        self._truth_shown.add(shape.id)
+            show_picture(logger, f"{shape.id}/truth_and_reconstruction", pair, step)
         return judge(mesh, truth, points=self.points)
 
     def _mesh(self, module: AutoDecoder, row: int) -> Mesh:

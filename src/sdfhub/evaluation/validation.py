@@ -19,6 +19,7 @@ from sdfhub.space import reconstruct
 if TYPE_CHECKING:
     from sdfhub.data.loading.datamodule import ValidationShape  # Lightning's, which spaces do without
 
+
 @dataclass(frozen=True)
 class Validation:
     """Scores a training shape with its own code, or a held-out one with a code fitted to its samples.
