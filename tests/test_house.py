@@ -100,7 +100,7 @@ def imported_at_start(module: str) -> set[str]:
 @pytest.mark.parametrize("slow", ["trimesh", "tensorboard", "jinja2", "playwright", "viser"])
 def test_a_training_starts_without(slow):
     """Hydra imports the callback of sweeps whenever it starts."""
-    found = imported_at_start("sdfhub.tasks.train") | imported_at_start("sdfhub.tasks.sweep")
+    found = imported_at_start("sdfhub.tasks.train") | imported_at_start("sdfhub.multirun.sweep")
     assert {"torch", "sdfhub.data.store.store", "sdfhub.tasks.prepare"} <= found
     assert slow not in found
 

@@ -4,51 +4,16 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = tuple(
-    [
-        "ckpt_path",
-        "output_root",
-        "checkpoint.",
-        "data.store",
-        "data.workers",
-        "data.loader.workers",
-        "data.loader.resident",
-        "data.validation",
-        "hparams_search.",
-        "logger",
-        "debug",
-        "paths.",
-        "extras",
-        "validation.",
-        "scale.mesh_every",
-        "callbacks.mesh",
-        "callbacks.slices",
-        "callbacks.checkpoint",
-        "callbacks.progress",
-        "callbacks.lr",
-        "callbacks.learning_rate",
-        "computing.points_at_once",
-        "computing.compile",
-        "computing.tinycudann",
-        "evaluate.workers",
-        "evaluate.fit_together",
-        "evaluate.pictures",
-        "trainer.enable_",
-        "trainer.log_every_n_steps",
-        "trainer.accelerator",
-        "trainer.devices",
-        "trainer.strategy",
-        "trainer.num_nodes",
-        "trainer.logger",
-        "trainer.callbacks",
-        "trainer.profiler",
-        "trainer.num_sanity",
-        "trainer.default_root_dir",
-        "trainer.check_val",
-        "trainer.val_check",
-        "trainer.limit_val",
-    ]
-)
+WHERE_NOT_WHAT = ("ckpt_path", "output_root", "checkpoint.", "data.store", "data.workers")
+WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "data.validation", "hparams_search.")
+WHERE_NOT_WHAT += ("logger", "debug", "paths.", "extras", "validation.", "scale.mesh_every", "callbacks.mesh")
+WHERE_NOT_WHAT += ("callbacks.slices", "callbacks.checkpoint", "callbacks.progress", "callbacks.lr")
+WHERE_NOT_WHAT += ("callbacks.learning_rate", "computing.points_at_once", "computing.compile")
+WHERE_NOT_WHAT += ("computing.tinycudann", "evaluate.workers", "evaluate.fit_together", "evaluate.pictures")
+WHERE_NOT_WHAT += ("trainer.enable_", "trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
+WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes", "trainer.logger", "trainer.callbacks")
+WHERE_NOT_WHAT += ("trainer.profiler", "trainer.num_sanity", "trainer.default_root_dir", "trainer.check_val")
+WHERE_NOT_WHAT += ("trainer.val_check", "trainer.limit_val")
 """Beginnings of keys that say where a run happens and how it is watched: they change no result.
 
 Other callbacks count: one that stops a training early decides its result.
