@@ -16,6 +16,7 @@ from sdfhub.data.preparation.sampling import prepare_mesh
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.errors import RejectedMesh
+from sdfhub.shapes import Frame
 from tests.broken_twins import chair_parts, errors, refined, triangles
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
@@ -145,8 +146,8 @@ def through_a_file(vertices: np.ndarray, faces: np.ndarray, path: Path):
 def test_neither_size_nor_place_of_a_file_matters(scale, shift, tmp_path):
     vertices, faces = CHAIR
     samples = through_a_file(vertices * scale + shift * scale, faces, tmp_path / "chair.obj")
-    center = samples.center / scale - shift
-    right, error = errors(dataclasses.replace(samples, center=center, scale=samples.scale * scale), CHAIR)
+    frame = Frame(samples.center / scale - shift, samples.scale * scale)
+    right, error = errors(dataclasses.replace(samples, frame=frame), CHAIR)
     assert right >= 0.999 and error < 1e-5
 
 

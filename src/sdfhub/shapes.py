@@ -34,8 +34,7 @@ def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )
     if not fits or array.dtype != dtype:
-        wanted = f"{list(shape)} {dtype}"
-        raise ValueError(f"{name}: expected {wanted}, got {list(array.shape)} {array.dtype}")
+        raise ValueError(f"{name}: expected {list(shape)} {dtype}, got {list(array.shape)} {array.dtype}")
 
 
 class Mesh(NamedTuple):
@@ -194,9 +193,8 @@ class Observation:
     def __post_init__(self):
         n = len(self.points)
         _check("points", self.points, (n, 3), np.float32)
-        _check("low", self.low, (n,), np.float32)
-        _check("high", self.high, (n,), np.float32)
-        _check("unsigned", self.unsigned, (n,), np.bool_)
+        for name, dtype in (("low", np.float32), ("high", np.float32), ("unsigned", np.bool_)):
+            _check(name, getattr(self, name), (n,), dtype)
         if not n or not all(np.isfinite(part).all() for part in (self.points, self.low, self.high)):
             raise ValueError("points, low and high: must be finite, at least one")
         if (self.low > self.high).any() or not 0 <= self.noise < np.inf:
@@ -238,10 +236,14 @@ class Batch:
         b, n = self.points.shape[:2]
         m = self.surface_points.shape[1]
         _check("rows", self.rows, (b,), torch.int64)
-        _check("points", self.points, (b, n, 3), torch.float32)
-        _check("sdf", self.sdf, (b, n), torch.float32)
-        _check("surface_points", self.surface_points, (b, m, 3), torch.float32)
-        _check("surface_normals", self.surface_normals, (b, m, 3), torch.float32)
+        shapes = {
+            "points": (b, n, 3),
+            "sdf": (b, n),
+            "surface_points": (b, m, 3),
+            "surface_normals": (b, m, 3),
+        }
+        for name, shape in shapes.items():
+            _check(name, getattr(self, name), shape, torch.float32)
 
     def to(self, device, non_blocking: bool = False) -> "Batch":
         """The same batch on another device."""

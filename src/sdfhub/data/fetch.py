@@ -6,6 +6,7 @@ put the two .deb files, or the folders unpacked from them, into the root by hand
 
 import argparse
 import io
+import logging
 import lzma
 import os
 import shutil
@@ -20,6 +21,8 @@ from typing import BinaryIO
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
+
+log = logging.getLogger(__name__)
 
 PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
 """Debian packages and the suffix of the meshes in them; nothing else of them is unpacked."""
@@ -36,27 +39,19 @@ def fetch(root: str | Path) -> None:
     """
     root = Path(root)
     root.mkdir(parents=True, exist_ok=True)
-    if not _missing(root):
-        print(f"{root}: both packages are there")
-        return
     with locked(root / ".lock", waiting=f"{root}: waiting for another process that fetches"):
-        _fetch(root)
-
-
-def _missing(root: Path) -> list[str]:
-    return [package for package, suffix in PACKAGES.items() if not any(root.rglob(f"*{suffix}"))]
-
-
-def _fetch(root: Path) -> None:
-    for leftover in root.glob(".fetch-*"):  # of a run that was killed
-        shutil.rmtree(leftover, ignore_errors=True)
-    for package in _missing(root):
-        with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
-            archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
-            unpacked = Path(scratch) / "unpacked"
-            count = unpack(archive, unpacked, PACKAGES[package])
-            os.rename(unpacked, root / package)
-            print(f"{package}: {count} files in {root / package}")
+        for leftover in root.glob(".fetch-*"):  # of a run that was killed
+            shutil.rmtree(leftover, ignore_errors=True)
+        for package, suffix in PACKAGES.items():
+            if any(root.rglob(f"*{suffix}")):
+                log.info("%s: is in %s", package, root)
+                continue
+            with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
+                archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
+                unpacked = Path(scratch) / "unpacked"
+                count = unpack(archive, unpacked, suffix)
+                os.rename(unpacked, root / package)
+                log.info("%s: %d files in %s", package, count, root / package)
 
 
 def unpack(archive: Path, folder: Path, suffix: str) -> int:
@@ -90,14 +85,13 @@ def unpack(archive: Path, folder: Path, suffix: str) -> int:
 def _is_wanted(member: tarfile.TarInfo, suffix: str) -> bool:
     path = PurePosixPath(member.name)
     is_inside = not path.is_absolute() and ".." not in path.parts
-    is_ours = path.suffix.lower() == suffix or path.name == "copyright"
-    return member.isreg() and is_inside and is_ours
+    return member.isreg() and is_inside and (path.suffix.lower() == suffix or path.name == "copyright")
 
 
 @contextmanager
 def _data_tar(archive: Path) -> Iterator[BinaryIO]:
     """The uncompressed data.tar of a .deb as a stream."""
-    if shutil.which("dpkg-deb"):  # knows every compression that Debian and Ubuntu use
+    if shutil.which("dpkg-deb"):  # reads every compression that Debian and Ubuntu use
         command = ["dpkg-deb", "--fsys-tarfile", str(archive)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
             yield process.stdout
@@ -106,24 +100,19 @@ def _data_tar(archive: Path) -> Iterator[BinaryIO]:
             raise ValueError(f"dpkg-deb ended with status {process.returncode}")
         return
     with archive.open("rb") as file:
-        name = _seek_data_member(file)
+        if file.read(8) != b"!<arch>\n":
+            raise ValueError("no ar archive")
+        name, size = "", 0
+        while not name.startswith("data.tar"):  # the last member
+            file.seek(size + size % 2, os.SEEK_CUR)
+            header = file.read(60)
+            if header[58:] != b"`\n":
+                raise ValueError("no data.tar in it")
+            name, size = header[:16].decode("ascii", "replace").strip().rstrip("/"), int(header[48:58])
         if not name.endswith(".xz"):
             raise SdfhubError(f"{archive}: {name} needs dpkg-deb; take Debian's package, not Ubuntu's")
         with lzma.open(file) as stream:
             yield stream
-
-
-def _seek_data_member(file: BinaryIO) -> str:
-    """Moves to the content of the `data.tar...` member of an ar archive, its last; returns its name."""
-    if file.read(8) != b"!<arch>\n":
-        raise ValueError("no ar archive")
-    while len(header := file.read(60)) == 60 and header[58:] == b"`\n":
-        name = header[:16].decode("ascii", "replace").strip().rstrip("/")
-        if name.startswith("data.tar"):
-            return name
-        size = int(header[48:58])
-        file.seek(size + size % 2, os.SEEK_CUR)
-    raise ValueError("no data.tar in it")
 
 
 def _archive_by_hand(root: Path, package: str) -> Path | None:
@@ -156,19 +145,19 @@ def _apt(folder: Path, *arguments: str) -> str:
 
 
 def _by_hand(package: str, root: Path, why: str) -> str:
-    wanted = " and ".join(f"{name}_*_all.deb" for name in PACKAGES)
-    return (
-        f"{package} is not in {root} and cannot be downloaded ({why}); "
-        f"get {wanted} from Debian's package pages, put them into {root} and run this again"
-    )
+    files = " and ".join(f"{name}_*_all.deb" for name in PACKAGES)
+    advice = f"get {files} from Debian's package pages, put them into {root} and run this again"
+    return f"{package} is not in {root} and cannot be downloaded ({why}); {advice}"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m sdfhub.data.fetch", description=fetch.__doc__)
     parser.add_argument("--root", default="data/open", help="where the meshes go (default: %(default)s)")
+    root = parser.parse_args(arguments).root
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     try:
-        fetch(parser.parse_args(arguments).root)
+        fetch(root)
     except (SdfhubError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -78,10 +78,8 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
         in no order; and the values [K] float32.
     """
     blocks = sampled.candidates(2).cells
-    states, active = (
-        _inferred_states(grid, sampled),
-        np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool),
-    )
+    states = _inferred_states(grid, sampled)
+    active = np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
     samples, crossed = [(_centre_keys(grid, sampled.cells, 2), sampled.values)], [np.empty(0, grid.integers)]
     states[samples[0][0]] = _evaluated_states(sampled.values)
     while len(blocks):
@@ -106,13 +104,11 @@ def _inferred_states(grid: Grid, sampled: SampledCells) -> np.ndarray:
     states = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
     within = (2 * sampled.cells[:, 1:] + 2 < grid.n).all(axis=1)
     sampled = SampledCells(*(array[within] for array in sampled))
-    centres, inferred = (
-        _centre_keys(grid, sampled.cells, 2),
-        np.where(sampled.values > 0, _INFERRED | _OUTSIDE, _INFERRED),
-    )
+    centres = _centre_keys(grid, sampled.cells, 2)
+    inferred = np.where(sampled.values > 0, _INFERRED | _OUTSIDE, _INFERRED).astype(np.int8)
     for squared in (3, 2, 1):
         sure = sampled.decides(np.sqrt(squared))
-        near, signs = centres[sure], inferred[sure].astype(np.int8)
+        near, signs = centres[sure], inferred[sure]
         for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared) - 1:
             states[near + _distance(offset, grid.n)] = signs
     return states
@@ -159,11 +155,9 @@ def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
     """Per sample, the steepest differences to its neighbours along the last three axes, as a norm."""
     squares = np.zeros_like(values)
     for axis in (-3, -2, -1):
-        steps = np.moveaxis(np.abs(np.diff(values, axis=axis)), axis, -1)
-        largest = np.zeros((*steps.shape[:-1], steps.shape[-1] + 1), values.dtype)
-        largest[..., :-1] = steps
-        largest[..., 1:] = np.maximum(largest[..., 1:], steps)
-        squares += np.moveaxis(largest, -1, axis) ** 2
+        moved = np.moveaxis(values, axis, 0)
+        steps = np.abs(np.diff(moved, axis=0, prepend=moved[:1], append=moved[-1:]))
+        squares += np.moveaxis(np.maximum(steps[:-1], steps[1:]), 0, axis) ** 2
     return np.sqrt(squares) / spacing
 
 

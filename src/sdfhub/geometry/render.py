@@ -4,6 +4,7 @@ Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +
 are linear RGB in [0, 1] until the last step, which maps them to sRGB bytes.
 """
 
+import igl
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -15,7 +16,7 @@ from sdfhub.triangles import face_normals
 CLAY = (0.30, 0.46, 0.72)
 """Default surface colour, linear RGB."""
 
-_CREASE = np.cos(np.radians(38))  # edges sharper than this stay sharp
+_CREASE = 38.0  # degrees; edges sharper than this stay sharp
 _SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
 _KEY = np.array([-0.45, -0.6, 0.95])
 _FILL = np.array([0.9, -0.25, 0.25])
@@ -115,46 +116,15 @@ def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndar
 
 def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed and flat unit normals at the hits, both turned towards the camera."""
-    cross = face_normals(vertices, faces)
-    of_face = _unit(cross)
     face = hits["primID"][seen]
-    flat = of_face[face]
-    if len(faces) > _SMOOTH_FACES or not len(face):
-        smooth = flat
-    else:
-        corners = _corner_normals_of(face, faces, cross, of_face)
+    flat = smooth = _unit(face_normals(vertices, faces[face]))
+    if len(faces) <= _SMOOTH_FACES:
+        corners = igl.per_corner_normals(vertices, faces.astype(np.int64), _CREASE).reshape(-1, 3, 3)[face]
         u, v = hits["u"][seen, None], hits["v"][seen, None]
         smooth = _unit((1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2])
     away = np.einsum("ij,ij->i", flat, directions) > 0
     sign = np.where(away, -1.0, 1.0)[:, None]
     return smooth * sign, flat * sign
-
-
-def _corner_normals_of(seen: np.ndarray, faces, cross, of_face) -> np.ndarray:
-    """[N, 3, 3] unit normals at the corners of the faces `seen` [N], from those around them alone."""
-    touched = np.zeros(faces.max() + 1, bool)
-    touched[faces[seen]] = True
-    near = touched[faces].any(axis=1)
-    return _corner_normals(faces[near], cross[near], of_face[near])[np.cumsum(near)[seen] - 1]
-
-
-def _corner_normals(faces: np.ndarray, cross: np.ndarray, of_face: np.ndarray) -> np.ndarray:
-    """[F, 3, 3] unit normals per corner: the area-weighted mean over neighbours within the crease angle."""
-    order = np.argsort(faces.ravel(), kind="stable")
-    valence = np.bincount(faces.ravel())
-    valence = valence[valence > 0]
-    start = np.repeat(np.cumsum(valence) - valence, valence)  # first corner of this corner's vertex
-    count = np.repeat(valence, valence)
-    total = np.zeros((faces.size, 3))
-    own = order // 3
-    for k in range(valence.max()):
-        rows = np.flatnonzero(count > k)
-        neighbour = own[start[rows] + k]
-        near = np.einsum("ij,ij->i", of_face[own[rows]], of_face[neighbour]) > _CREASE
-        total[rows[near]] += cross[neighbour[near]]
-    corners = np.empty_like(total)
-    corners[order] = _unit(total)
-    return corners.reshape(-1, 3, 3)
 
 
 def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:

@@ -15,12 +15,9 @@ def back(chair) -> list[Manifold]:
 
 
 def point(chair, side: float, height: float) -> np.ndarray:
-    """A point of the back's middle surface.
+    """A point of the back's middle surface, `height` metres above the seat.
 
-    Args:
-        chair: whose back it is.
-        side: from -1 (left post) to 1 (right post).
-        height: above the seat in metres; the bow and the lean grow with it.
+    `side` runs from -1 (left post) to 1 (right post); the bow and the lean grow with the height.
     """
     h = height / chair.back_height
     if chair.seat == "round":

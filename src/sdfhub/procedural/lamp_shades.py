@@ -17,9 +17,7 @@ def height(lamp) -> float:
 def head(lamp, hung: bool) -> Manifold:
     """The shade with its bulb and fitting; the axis is z, the lower rim of the shade lies at z = 0.
 
-    Args:
-        lamp: whose head it is.
-        hung: held from above by a rod that ends above the shade; else from below by one that ends under it.
+    A hung one is held from above by a rod that ends above it, another from below by one that ends under it.
     """
     tall, gauge = height(lamp), lamp.gauge()
     build = {"dome": _dome, "globe": _globe, "bowl": _bowl}.get(lamp.shade, _open)

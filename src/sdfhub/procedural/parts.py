@@ -25,13 +25,9 @@ def box(size: Point, centre: Point) -> Manifold:
 
 
 def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Manifold:
-    """A box whose edges and corners are rounded with one radius: a cushion, a padded arm.
+    """A box of full extents `size` whose edges and corners have one radius: a cushion, a padded arm.
 
-    Args:
-        size: [3] full extents.
-        centre: [3].
-        radius: of the rounding; cut to half the thinnest extent.
-        steps: facets per quarter of a circle.
+    The radius is cut to half the thinnest extent; a quarter of a circle has `steps` facets.
     """
     half = np.asarray(size, float) / 2
     r = min(radius, 0.98 * half.min())
@@ -43,13 +39,9 @@ def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Ma
 
 
 def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: int = 3) -> Manifold:
-    """A convex outline extruded from bottom to top with rounded rims: a seat, a table top, a cushion.
+    """A convex outline [N, 2] extruded with rounded rims: a seat, a table top, a cushion.
 
-    Args:
-        outline: [N, 2] convex polygon.
-        bottom, top: heights.
-        radius: of the rims, < half the outline's width; 0 keeps them sharp.
-        steps: facets per quarter of a circle.
+    The radius of the rims is below half the outline's width, 0 keeps them sharp; `steps` as in `rounded_box`.
     """
     r = min(radius, 0.49 * (top - bottom))
     if r <= 0:
@@ -71,10 +63,10 @@ def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
 
 
 def loft(sections: np.ndarray) -> Manifold:
-    """The solid through a sequence of closed sections, with flat ends.
+    """The solid through closed sections, with flat ends.
 
     Args:
-        sections: [K, N, 3] points of K star-shaped sections of N points each, all with one sense of rotation.
+        sections: [K, N, 3] points of K star-shaped sections of N points, all with one sense of rotation.
     """
     vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
     faces = _loft_faces(*sections.shape[:2])
@@ -162,10 +154,7 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, stretch: b
 def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:
     """An open shell of revolution around z: a lampshade, a bowl.
 
-    Args:
-        profile: [N, 2] (radius, height) of its middle surface, radii > thickness / 2.
-        thickness: of the wall.
-        segments: sides of the circle.
+    `profile` [N, 2] holds (radius, height) of its middle surface, radii > thickness / 2.
     """
     profile = np.asarray(profile, float)
     tangent = _unit(np.gradient(profile, axis=0))

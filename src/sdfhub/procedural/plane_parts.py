@@ -102,13 +102,9 @@ class Station:
 
 
 def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """A section of unit chord and unit thickness.
+    """Places [points] along a section of unit chord and thickness, and half its thickness [points] there.
 
     Source: NACA report 460, thickness of the four-digit sections.
-
-    Returns:
-        along: [points] from leading to trailing edge.
-        half: [points] half thickness, 0.5 at its greatest.
     """
     x = (1 - np.cos(np.linspace(0, np.pi, points))) / 2
     powers = np.stack([np.sqrt(x), x, x**2, x**3, x**4])
@@ -118,11 +114,8 @@ def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
 def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
     """A wing, fin or tailplane through its stations, with a blunt trailing edge.
 
-    Args:
-        stations: from end to end.
-        ratio: thickness over chord.
-        gauge: least thickness; the trailing edge has 0.8 of it.
-        camber: of the mean line, in chords.
+    `ratio` is thickness over chord, `camber` that of the mean line in chords. `gauge` is the least thickness;
+    the trailing edge has 0.8 of it.
     """
     along, half = aerofoil()
     sections = []
@@ -138,12 +131,10 @@ def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber:
 
 
 def panel(root, direction, length: float, chords, sweep: float, ratio: float, gauge: float) -> Manifold:
-    """A tapered swept surface with a rounded tip, from a leading-edge point along a direction.
+    """A tapered swept surface with a rounded tip, from a leading-edge point `root` along a direction.
 
     Args:
-        root: [3] leading edge where it starts.
-        direction: [2] unit vector in x, z.
-        length: along the direction.
+        direction: [2] unit vector in x, z; `length` is measured along it.
         chords: at the root and at the tip.
         sweep: of the leading edge, degrees.
         ratio, gauge: as of `lifting_surface`.
@@ -176,13 +167,8 @@ def jet(radius: float, length: float, centre) -> Manifold:
 def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
     """A pointed spinner and twisted blades in the plane y = centre[1].
 
-    Args:
-        radius: of the tips.
-        hub: radius of the spinner's foot.
-        blades: how many.
-        gauge: thickness of the blades.
-        centre: [3].
-        turn: angle of the first blade, degrees.
+    `radius` is that of the tips, `hub` that of the spinner's foot; blades are `gauge` thick, and the first
+    one stands at `turn` degrees.
     """
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
     made = [body_of_revolution(parts.scaled(profile, hub, hub), centre, 14)]
@@ -210,12 +196,8 @@ def wheel(radius: float, width: float, centre) -> Manifold:
 def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
     """A bubble that rises from a line along y: a fighter's canopy, a light aircraft's cabin.
 
-    Args:
-        front, back: its ends.
-        peak: where it is highest, as a share of its length.
-        base: function of y, the height it stands on.
-        half_width: at the peak.
-        height: above the base.
+    It stands on the height base(y) and is highest, and `half_width` wide to either side, at the share `peak`
+    of its length.
     """
     unit = superellipse(16, 2.4)
     sections = []

@@ -26,7 +26,6 @@ def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Mani
     """A leaning wall with rounded top and ends.
 
     Args:
-        sofa: whose back it is.
         x: [K] increasing stations from the left end to the right.
         top: [K] heights there.
         push: how far the front swells towards -y: one number, [K] numbers, or a function of (x, heights).

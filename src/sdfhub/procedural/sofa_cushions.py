@@ -7,15 +7,9 @@ from sdfhub.procedural import parts
 
 
 def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps: int = 3) -> Manifold:
-    """A stuffed block whose +z side swells.
+    """A stuffed block of full extents `size` whose +z side swells, `crown` above its rim in the middle.
 
-    Args:
-        size: [3] full extents without the crown.
-        centre: [3].
-        radius: of the rounded edges.
-        crown: how far the middle of the +z side stands above its rim.
-        lean: turn around x in degrees, about the centre.
-        steps: facets per quarter of a circle.
+    It is turned by `lean` degrees around x about its centre; radius and steps as in `rounded_box`.
     """
     block = parts.rounded_box(size, (0, 0, 0), radius, steps)
     u, v = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-0.94, 0.94, 7)], indexing="ij"))

@@ -5,7 +5,7 @@ are computed apart and combined by the caller.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -31,29 +31,16 @@ NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
 """Edges above which faces are cut before a tree is built over them."""
 
 
-@dataclass(frozen=True)
-class Nearest:
-    """The nearest points of a surface.
-
-    Args:
-        distance: [N] float64, unsigned.
-        face: [N] int64, row of the nearest face.
-        foot: [N, 3] float64, the nearest point on it.
-    """
+class Nearest(NamedTuple):
+    """Of N points: unsigned distance [N] to the surface, nearest face [N] (a row), nearest point [N, 3]."""
 
     distance: np.ndarray
     face: np.ndarray
     foot: np.ndarray
 
 
-@dataclass(frozen=True)
-class Signs:
-    """On which side of the surface each point lies.
-
-    Args:
-        inside: [N] bool.
-        certain: [N] bool, far enough from a tie to be trusted.
-    """
+class Signs(NamedTuple):
+    """Of N points: whether they lie inside [N], and far enough from a tie to be certain [N]."""
 
     inside: np.ndarray
     certain: np.ndarray

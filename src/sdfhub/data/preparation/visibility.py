@@ -6,6 +6,7 @@ from both sides is a sheet without an inside.
 
 import os
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -62,13 +63,10 @@ class Surface:
         return self.faces[~self.two_sided]
 
 
-@dataclass(frozen=True)
-class Sightings:
-    """How much of each face is seen, as a share of what an isolated face would be from all around.
+class Sightings(NamedTuple):
+    """How much of the faces is seen, as a share of what isolated ones would be from all around.
 
-    Args:
-        front: [F] of the counter-clockwise side, in [0, 1]; an unoccluded side reaches about 0.5.
-        back: [F] of the other side.
+    Front is the counter-clockwise side. An unoccluded side reaches about 0.5.
     """
 
     front: np.ndarray
@@ -82,13 +80,13 @@ def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sig
     many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
     large ones more often; a second looks again at those that the first leaves open.
     """
-    watch = _Watch(mesh, rng.permutation(sphere_directions(views)), rng)
-    large = (watch.area / watch.area.sum() * LARGE).astype(np.int64)
-    watch.look(np.arange(len(large)), large + _fair(len(large), FIRST))
-    again = np.flatnonzero(_is_open(*watch.sums))
+    observer = _Observer(mesh, rng.permutation(sphere_directions(views)), rng)
+    large = (observer.area / observer.area.sum() * LARGE).astype(np.int64)
+    observer.look(np.arange(len(large)), large + _fair(len(large), FIRST))
+    again = np.flatnonzero(_is_open(*observer.sums))
     if len(again):
-        watch.look(again, AGAIN * large[again] + _fair(len(again), SECOND))
-    return Sightings(*(watch.sums[:2] / np.maximum(watch.sums[2], 1e-12)))
+        observer.look(again, AGAIN * large[again] + _fair(len(again), SECOND))
+    return Sightings(*(observer.sums[:2] / np.maximum(observer.sums[2], 1e-12)))
 
 
 def _fair(faces: int, most: int) -> int:
@@ -100,7 +98,7 @@ def _is_open(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarra
     return (front + back < SURE * cast) | (np.minimum(front, back) > 0)
 
 
-class _Watch:
+class _Observer:
     """Rays from all around at the faces of one mesh, and the sums of what they have seen.
 
     Args:

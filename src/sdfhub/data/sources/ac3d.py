@@ -3,20 +3,21 @@
 Source: AC3D file format specification (inivis).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from sdfhub.errors import RejectedMesh
+from sdfhub.shapes import Mesh
 
 MAX_DEPTH = 100
 POLYGON, STRIP = 0, 4
 """Surface types with an area (the low four bits of `SURF`); 1 and 2 are closed and open lines."""
 
 
-def read_ac3d(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] float64 and triangles [F, 3] int64 of an AC3D file, all objects in the world's frame.
+def read_ac3d(content: bytes) -> Mesh:
+    """The mesh of an AC3D file, all objects in the world's frame.
 
     Polygons become fans, lines are skipped.
 
@@ -25,15 +26,16 @@ def read_ac3d(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     """
     if not content.startswith(b"AC3D"):
         raise RejectedMesh("corrupt_file", "does not start with AC3D")
-    reader = _Reader(content)
-    triangles = _Triangles()
+    reader, parts = _Reader(content), [Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
     try:
         while (line := reader.next_line()) is not None:
             if line[:1] == ["OBJECT"]:
-                _read_object(reader, triangles, np.eye(3), np.zeros(3), 0)
+                _read_object(reader, parts, np.eye(3), np.zeros(3), 0)
     except (ValueError, IndexError, OverflowError) as error:
         raise RejectedMesh("corrupt_file", f"byte {reader.position}: {error}") from error
-    return triangles.arrays()
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + offset for part, offset in zip(parts, first, strict=False)]
+    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 @dataclass
@@ -74,26 +76,8 @@ class _Reader:
         self.position += count + 1  # and the end of its line
 
 
-@dataclass
-class _Triangles:
-    vertices: list[np.ndarray] = field(default_factory=list)
-    faces: list[tuple[int, int, int]] = field(default_factory=list)
-    count: int = 0
-
-    def add_vertices(self, vertices: np.ndarray) -> int:
-        """Adds [V, 3] vertices; returns the index of the first."""
-        first = self.count
-        self.vertices.append(vertices)
-        self.count += len(vertices)
-        return first
-
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        vertices = np.concatenate([np.zeros((0, 3)), *self.vertices])
-        return vertices, np.array(self.faces, dtype=np.int64).reshape(-1, 3)
-
-
 def _read_object(
-    reader: _Reader, triangles: _Triangles, rotation: np.ndarray, origin: np.ndarray, depth: int
+    reader: _Reader, parts: list[Mesh], rotation: np.ndarray, origin: np.ndarray, depth: int
 ) -> None:
     """Reads one object and its kids, up to and with the last kid.
 
@@ -122,16 +106,16 @@ def _read_object(
                 break
     origin = location @ rotation + origin
     rotation = own_rotation @ rotation
-    if any(not 0 <= corner < len(vertices) for face in surfaces for corner in face):
+    faces = np.array(surfaces, dtype=np.int64).reshape(-1, 3)
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise ValueError("a surface has a vertex that is not there")
-    first = triangles.add_vertices(vertices @ rotation + origin)
-    triangles.faces += [(a + first, b + first, c + first) for a, b, c in surfaces]
+    parts.append(Mesh(vertices @ rotation + origin, faces))
     for _ in range(kids):
         while (words := reader.next_line()) is not None and words[:1] != ["OBJECT"]:
             pass
         if words is None:
             return  # many files announce more kids than they hold
-        _read_object(reader, triangles, rotation, origin, depth + 1)
+        _read_object(reader, parts, rotation, origin, depth + 1)
 
 
 def _read_surface(reader: _Reader) -> list[tuple[int, int, int]]:

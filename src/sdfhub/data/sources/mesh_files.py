@@ -10,6 +10,7 @@ import numpy as np
 
 from sdfhub.data.sources.ac3d import read_ac3d
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.shapes import Mesh
 
 FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
 MAX_BYTES = 1 << 30
@@ -20,8 +21,8 @@ MAX_VERTICES = 50_000_000
 _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
 
 
-def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] float64 and triangles [F, 3] int64 of a mesh file, in the file's frame and units.
+def read_mesh(path: str | Path) -> Mesh:
+    """The mesh in a file, in the file's frame and units.
 
     The parts of a scene are put together under their transforms; polygons become triangles. Vertices are
     neither merged nor dropped.
@@ -40,9 +41,7 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     return triangles_of(path.read_bytes(), path.suffix.lower(), str(path), path.parent)
 
 
-def triangles_of(
-    content: bytes, suffix: str, name: str, folder: Path | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = None) -> Mesh:
     """The triangles of a mesh file's content; see `read_mesh`.
 
     Args:
@@ -60,17 +59,17 @@ def triangles_of(
         check_length(content, suffix)
         if suffix in (".glb", ".gltf"):
             _check_gltf(content, suffix)
-        vertices, faces = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
+        mesh = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
     except RejectedMesh as rejection:
         raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
-    except MemoryError:  # the machine's trouble, not the file's
+    except MemoryError:  # no fault of the file
         raise
     except Exception as error:  # trimesh raises whatever the broken bytes lead to
         is_foreign = isinstance(error, ImportError)  # it would guess at the encoding of what is no text
         why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
         raise RejectedMesh("corrupt_file", f"{name} cannot be read as {suffix[1:]} ({why})") from error
-    _check_triangles(vertices, faces, name)
-    return vertices, faces
+    _check_triangles(*mesh, name)
+    return mesh
 
 
 def check_length(content: bytes, suffix: str) -> None:
@@ -98,7 +97,9 @@ def _check_gltf(content: bytes, suffix: str) -> None:
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
     scene = json.loads(content)
     primitives = [primitive for mesh in scene.get("meshes", []) for primitive in mesh["primitives"]]
-    packed = {name for each in [scene, *primitives] for name in _extensions(each) if "compression" in name}
+    names = {*scene.get("extensionsRequired", []), *scene.get("extensions", {})}
+    names = names.union(*(primitive.get("extensions", {}) for primitive in primitives))
+    packed = {name for name in names if "compression" in name}
     if packed:
         raise RejectedMesh("compressed", f"needs {', '.join(sorted(packed))}; export it without compression")
     accessors = scene.get("accessors", [])
@@ -113,16 +114,12 @@ def _check_gltf(content: bytes, suffix: str) -> None:
         raise RejectedMesh("too_large", f"draws {drawn:,} vertices, at most {MAX_VERTICES:,} are read")
 
 
-def _extensions(node: dict) -> list[str]:
-    return [*node.get("extensionsRequired", []), *node.get("extensions", {})]
-
-
 def _lines(body: bytes) -> int:
-    """Lines with something on them."""
+    """Number of lines that are not blank."""
     return sum(1 for line in body.splitlines() if line.strip())
 
 
-def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.ndarray, np.ndarray]:
+def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> Mesh:
     import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
 
     options = {}
@@ -135,7 +132,7 @@ def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> tuple[np.nd
         mesh = trimesh.load_mesh(
             io.BytesIO(content), file_type=suffix[1:], process=False, resolver=files, **options
         )
-    return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+    return Mesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))
 
 
 def _utf8(content: bytes) -> bytes:
@@ -195,6 +192,6 @@ def buffer_path(folder: Path | None, name: str) -> Path | None:
         folder: of the .gltf.
         name: percent-encoded, as the format has it; some exporters write names as they are.
     """
-    paths = [(folder / each).resolve() for each in (name, unquote(name))] if folder else []
-    found = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
-    return found[0] if found and found[0].stat().st_size <= MAX_BYTES else None
+    paths = [(folder / spelling).resolve() for spelling in (name, unquote(name))] if folder else []
+    paths = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
+    return paths[0] if paths and paths[0].stat().st_size <= MAX_BYTES else None

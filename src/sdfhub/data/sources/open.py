@@ -14,6 +14,7 @@ from sdfhub.data.sources.furniture import furniture_in, read_model
 from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
 from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, plain_categories
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.triangles import face_normals
 from sdfhub.whole_file import write_whole
 
 MEASURES = ".measured.json"
@@ -131,18 +132,15 @@ class OpenSource(Source):
         if known.get(key, {}).get("faces"):
             return known[key]
         measure = _measured(model)
-        if measure[
-            "faces"
-        ]:  # what cannot be read is tried again: the fault may be this machine's or version's
+        if measure["faces"]:  # a model that cannot be read is tried again: the fault may be this machine's
             known[key] = measure
         return measure
 
     def _read_measures(self) -> dict[str, dict]:
-        try:
+        with suppress(OSError, ValueError):
             known = json.loads((self.root / MEASURES).read_text())
-        except (OSError, ValueError):
-            return {}
-        return known if isinstance(known, dict) else {}
+            return known if isinstance(known, dict) else {}
+        return {}
 
     def _write_measures(self, known: dict[str, dict]) -> None:
         content = json.dumps(known, indent=1, sort_keys=True).encode()
@@ -174,9 +172,7 @@ def _measured(model: _Model) -> dict:
         vertices, faces = model.triangles()
     except RejectedMesh:
         return {"faces": 0}
-    corners = vertices[faces]
-    extents = corners.max(axis=(0, 1)) - corners.min(axis=(0, 1))
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normals, axis=1).sum() / 2
+    extents = np.ptp(vertices[faces.ravel()], axis=0)
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
     twin = " ".join(f"{value:.4g}" for value in (*extents, area))
     return {"faces": len(faces), "twin": twin, "sha256": hashlib.sha256(model.content()).hexdigest()}
