@@ -1,6 +1,7 @@
 """A table of the paper is one command: its cells compose, go on where they stopped, and fail alone."""
 
 import json
+import re
 import sys
 from functools import cache
 from pathlib import Path
@@ -193,7 +194,7 @@ def test_an_interrupted_sweep_goes_on_with_what_is_missing_and_repeats_nothing(t
     trainer.calls, trainer.interrupt = [], None
     assert status() == 0
     assert trainer.calls == ALL[1:]
-    assert "| DeepSDF |" in capsys.readouterr().out
+    assert "| DeepSDF " in capsys.readouterr().out
 
 
 def test_groups_that_no_name_tells_are_settings_where_they_are_said(trainer, monkeypatch, tmp_path):
@@ -214,7 +215,7 @@ def test_a_failing_cell_stops_no_other_and_is_tried_again(trainer, tmp_path, cap
     assert trainer.calls == ALL
     told = capsys.readouterr()
     assert "the loss is not finite at step 7" in told.err and "Traceback" not in told.err
-    assert "| DeepSDF, seed 0 | failed | the loss is not finite at step 7 |" in told.out
+    assert re.search(r"\| DeepSDF, seed 0 +\| failed +\| the loss is not finite at step 7 +\|", told.out)
     assert "the loss is not finite at step 7" in (sweep / "report" / "report.html").read_text()
     trainer.calls, trainer.fail = [], None
     assert status() == 0

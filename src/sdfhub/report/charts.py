@@ -81,8 +81,8 @@ def _style(group: Group, row: Row) -> dict[str, str]:
 
 
 def _text(text: str) -> str:
-    """Text in which matplotlib finds no formulas."""
-    return text.replace("$", r"\$")
+    """A label of bearable length in which matplotlib finds no formulas."""
+    return (text if len(text) < 60 else f"{text[:58]}…").replace("$", r"\$")
 
 
 def _data_uri(figure: Figure) -> str:

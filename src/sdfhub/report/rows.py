@@ -66,7 +66,7 @@ class Group:
 
     Args:
         judging: options of JUDGING_GROUPS, and values of JUDGING_SETTINGS on the command line.
-        rows: in the order of the commands.
+        rows: methods in the order of the commands, each with normals first.
     """
 
     judging: dict[str, str]
@@ -186,7 +186,8 @@ def _rows(cells: list[Cell]) -> list[Row]:
             row = Row(*_name(plan.choices), detail, part)
             twins = sum(row.label == other.label for other in rows)  # labels name rows: no two are equal
             rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
-    return rows
+    methods = list(dict.fromkeys(row.method for row in rows))
+    return sorted(rows, key=lambda row: (methods.index(row.method), row.normals != "on"))
 
 
 def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
