@@ -33,7 +33,7 @@ from sdfhub.whole_file import write_whole
 KEYS = re.compile(r"(?:^|\s)['\"]?[+~]*([^\s='\"]+)")
 """Keys of a command's words, quoted or not, whole or cut."""
 
-SCORES = ("objective", "known", "known_median", "held_out", "held_out_median", "seconds")
+SCORES = ("objective", "train", "train_median", "held_out", "held_out_median", "seconds")
 
 
 class Trial(NamedTuple):

@@ -27,9 +27,11 @@ def loss_chart(group: Group) -> str | None:
         for number, curve in enumerate(filter(None, (loss_curve(cell.folder) for cell in row.done))):
             label = _text(row.label) if number == 0 else None
             axes.plot(*zip(*curve, strict=True), **_style(group, row), lw=1.3, label=label)
+    if not axes.lines:
+        return None
     axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
     axes.legend(frameon=False, fontsize=8)
-    return _data_uri(figure) if axes.lines else None
+    return _data_uri(figure)
 
 
 @matplotlib.rc_context(STYLE)
@@ -40,6 +42,8 @@ def shape_chart(group: Group, role: str) -> str | None:
     """
     shapes = group.shapes[(group.shapes["role"] == role) & (group.shapes["cd"] > 0)]
     rows = [row for row in group.rows if (shapes["label"] == row.label).any()]
+    if not rows:
+        return None
     figure = Figure((7.6, 0.8 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for height, row in enumerate(rows):
@@ -54,7 +58,7 @@ def shape_chart(group: Group, role: str) -> str | None:
     axes.axvline(shapes["floor"].mean(), color="#5d6672", ls=":", lw=1)
     axes.set(xscale="log", xlabel="CD times 10³ (dotted: noise floor)", ylim=(len(rows) - 0.5, -0.5))
     axes.set_yticks(range(len(rows)), [_text(row.label) for row in rows])
-    return _data_uri(figure) if rows else None
+    return _data_uri(figure)
 
 
 def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tuple[int, float]]:
@@ -77,8 +81,8 @@ def _style(group: Group, row: Row) -> dict[str, str]:
 
 
 def _text(text: str) -> str:
-    """Text in which matplotlib finds no formulas."""
-    return text.replace("$", r"\$")
+    """A label of bearable length in which matplotlib finds no formulas."""
+    return (text if len(text) < 60 else f"{text[:58]}…").replace("$", r"\$")
 
 
 def _data_uri(figure: Figure) -> str:

@@ -2,9 +2,7 @@
 
 import base64
 import hashlib
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -14,26 +12,14 @@ from sdfhub.report.charts import loss_chart, shape_chart
 from sdfhub.report.pictures import Sheet, data_uri
 from sdfhub.report.results import ROLES, Cell
 from sdfhub.report.rows import Group
-from sdfhub.report.tables import TITLES, Table, overview, tables
-
-
-@dataclass(frozen=True)
-class Part:
-    """What the page shows of a group of comparable rows."""
-
-    title: str
-    tables: list[Table]
-    charts: list[tuple[str, str]]
-    sheet: Sheet
-    extremes: Sheet
-    turning: list[dict]
+from sdfhub.report.tables import TITLES, Table
 
 
 def page(
     name: str,
     cells: list[Cell],
     groups: list[Group],
-    origin: Table,
+    tables: list[list[Table]],
     sheets: list[tuple[Sheet, Sheet]],
     turning: list[list[dict]],
 ) -> str:
@@ -43,13 +29,15 @@ def page(
         name: of the sweep.
         cells: all of them.
         groups: their rows.
-        origin: how it was made.
+        tables: those of all groups first, then each group's, then how the sweep was made.
         sheets: of each group, the contact sheet and the extremes.
         turning: of each group, the meshes to turn.
     """
+    overview, *tables, origin = tables
     parts = [
-        Part(group.title, tables(group), _charts(group), *pictures, meshes)
-        for group, pictures, meshes in zip(groups, sheets, turning, strict=True)
+        {"title": group.title, "tables": own, "charts": _charts(group), "turning": meshes}
+        | {"sheet": sheet, "extremes": extremes}
+        for group, own, (sheet, extremes), meshes in zip(groups, tables, sheets, turning, strict=True)
     ]
     states = [cell.state for cell in cells]
     counts = [f"{states.count(state)} {state}" for state in ("failed", "missing") if state in states]
@@ -62,8 +50,7 @@ def page(
         name=name,
         counts=", ".join([f"{states.count('done')} of {len(cells)} cells done", *counts]),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        version=_version(),
-        overview=overview(groups),
+        overview=overview,
         parts=parts,
         origin=origin,
         style=Markup(_text("page.css")),
@@ -73,19 +60,10 @@ def page(
 
 
 def _charts(group: Group) -> list[tuple[str, str]]:
-    charts = [("Loss of signed distances while training, a line a seed", loss_chart(group))]
-    charts += [
-        (f"{TITLES[role]}: CD of each, all seeds; the bar is the median", shape_chart(group, role))
-        for role in ROLES
-    ]
-    return [(caption, chart) for caption, chart in charts if chart]
-
-
-def _version() -> str:
-    try:
-        return version("sdfhub")
-    except PackageNotFoundError:  # run from a folder without an installation
-        return "(not installed)"
+    charts = {"Loss of signed distances while training, a line a seed": loss_chart(group)}
+    for role in ROLES:
+        charts[f"{TITLES[role]}: CD of each, all seeds; the bar is the median"] = shape_chart(group, role)
+    return [(caption, chart) for caption, chart in charts.items() if chart]
 
 
 def _text(name: str) -> str:

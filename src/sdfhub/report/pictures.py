@@ -13,7 +13,7 @@ from sdfhub.data.workers import stream_in_processes, workers_worth
 from sdfhub.geometry.render import render
 from sdfhub.report.meshes import FindTruth, Mesh, packed, reconstruction, true_mesh
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
-from sdfhub.report.rows import Group, Row
+from sdfhub.report.rows import Group
 
 PIXELS, PAPER = 208, 0.955
 """Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
@@ -148,7 +148,7 @@ def picture(read_mesh: Callable[[], Mesh | None]) -> np.ndarray | None:
 
 
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
-    """Role and id of the shapes to show: training ones, and up to a third held out, from the front of each."""
+    """Role and id of the shapes to show: the first training ones, and up to a third held out."""
     cell = next((cell for row in group.rows for cell in row.done), None)
     train, unseen = (list(_scores(cell, role)) if cell else [] for role in ROLES)
     unseen = unseen[: max(count // 3, count - len(train))]

@@ -65,35 +65,28 @@ class Group:
     """Rows that may be compared: the same sweep, shapes, scale and way of judging.
 
     Args:
-        choices: options of JUDGING_GROUPS.
-        judging: values of JUDGING_SETTINGS on the command line.
-        shared: other values on the command line that all rows have.
-        varying: names of choices in which the groups of the sweep differ.
-        rows: in the order of the commands.
+        judging: options of JUDGING_GROUPS, and values of JUDGING_SETTINGS on the command line.
+        rows: methods in the order of the commands, each with normals first.
     """
 
-    choices: dict[str, str]
     judging: dict[str, str]
-    shared: dict[str, str]
-    varying: set[str]
     rows: list[Row]
 
     @property
     def title(self) -> str:
-        """`chairs, data=open, scale=cpu, trained on 20`."""
+        """`chairs, data=open, scale=cpu, fit=gauss_newton, evaluate=paper, trained on 20`."""
         return ", ".join(self.title_parts)
 
     @property
     def title_parts(self) -> list[str]:
         """The words of the title: the category, or the name of the user's folder, first."""
-        subject = self.choices.get("category", "all")
-        if self.choices.get("data") == "folder" and "data.source.root" in self.judging:
+        subject = self.judging.get("category", "all")
+        if self.judging.get("data") == "folder" and "data.source.root" in self.judging:
             subject = Path(self.judging["data.source.root"]).name
-        named = {"data", "scale", *self.varying} - {"category"}
-        told = {name: option for name, option in self.choices.items() if name in named} | self.judging
-        shapes = [cell.scores.trained_on for row in self.rows for cell in row.done]
-        ends = " to ".join(dict.fromkeys(map(str, (min(shapes), max(shapes))))) if shapes else ""
-        return [subject, *(f"{k}={v}" for k, v in told.items()), *([f"trained on {ends}"] if ends else [])]
+        parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
+        counts = {cell.scores.trained_on for row in self.rows for cell in row.done}
+        ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
+        return [subject, *parts, f"trained on {ends}"]
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
@@ -164,44 +157,37 @@ def group_cells(cells: list[Cell]) -> list[Group]:
     """The cells of a sweep as groups of rows."""
     members: dict[tuple, list[Cell]] = {}
     for cell in cells:
-        members.setdefault(tuple(map(str, (_choices(cell), _judging(cell)))), []).append(cell)
-    varying = set(differing([_choices(cells[0]) for cells in members.values()]))
-    return [_group(cells, varying) for cells in members.values()]
-
-
-def _choices(cell: Cell) -> dict[str, str]:
-    return {name: cell.plan.choices[name] for name in JUDGING_GROUPS if name in cell.plan.choices}
+        members.setdefault(tuple(_judging(cell).items()), []).append(cell)
+    return [Group(dict(judging), _rows(cells)) for judging, cells in members.items()]
 
 
 def _judging(cell: Cell) -> dict[str, str]:
-    settings = sorted(cell.plan.settings.items())
-    return {k: v for k, v in settings if k.startswith(JUDGING_SETTINGS) and not k.startswith("data.loader.")}
+    choices = {name: cell.plan.choices[name] for name in JUDGING_GROUPS if name in cell.plan.choices}
+    settings = {k: v for k, v in sorted(cell.plan.settings.items()) if k.startswith(JUDGING_SETTINGS)}
+    return choices | {k: v for k, v in settings.items() if not k.startswith("data.loader.")}
 
 
-def _group(cells: list[Cell], varying: set[str]) -> Group:
-    shared = dict(sorted(set.intersection(*(set(cell.plan.settings.items()) for cell in cells))))
+def _rows(cells: list[Cell]) -> list[Row]:
+    shared = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
     commands: dict[tuple, list[Cell]] = {}
     for cell in cells:
         commands.setdefault(cell.plan.identity[:2], []).append(cell)
     rows: list[Row] = []
     for members in commands.values():
         plan = members[0].plan
-        name = _method(plan.choices), plan.choices.get("normals", "?")
-        namesakes = [cell.plan.choices for cell in cells if _method(cell.plan.choices) == name[0]]
-        namesakes = [choices for choices in namesakes if choices.get("normals", "?") == name[1]]
-        own = {k: v for k, v in plan.settings.items() if k not in shared}
-        own |= {k: plan.choices.get(k, NONE) for k in differing(namesakes)}
+        namesakes = [cell.plan.choices for cell in cells if _name(cell.plan.choices) == _name(plan.choices)]
+        own = dict(pair for pair in plan.settings.items() if pair not in shared)
+        own |= {key: plan.choices.get(key, NONE) for key in differing(namesakes)}
         parts = _by_settings(members)
         changed = differing([settings_of(part[0]) for part in parts]) if len(parts) > 1 else {}
         for number, part in enumerate(parts):
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
-            row = Row(*name, ", ".join(f"{key}={_short(value)}" for key, value in words.items()), part)
-            twins = sum(row.label == other.label for other in rows)
-            rows.append(replace(row, detail=f"{row.detail}, {twins + 1}") if twins else row)
-    judging = _judging(cells[0])
-    return Group(
-        _choices(cells[0]), judging, {k: shared[k] for k in shared if k not in judging}, varying, rows
-    )
+            detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
+            row = Row(*_name(plan.choices), detail, part)
+            twins = sum(row.label == other.label for other in rows)  # labels name rows: no two are equal
+            rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
+    methods = list(dict.fromkeys(row.method for row in rows))
+    return sorted(rows, key=lambda row: (methods.index(row.method), row.normals != "on"))
 
 
 def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
@@ -215,10 +201,14 @@ def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
     return found
 
 
-def _method(choices: dict[str, str]) -> str:
+def _name(choices: dict[str, str]) -> tuple[str, str]:
+    """Method and normals."""
     encoding, activation = choices.get("encoding", "none"), choices.get("activation", "?")
     is_deepsdf = choices.get("decoder") == "deepsdf" and activation == "relu"
-    return PREFIXES.get(encoding, f"{encoding.upper()}/") + ("DeepSDF" if is_deepsdf else activation.upper())
+    method = PREFIXES.get(encoding, f"{encoding.upper()}/") + (
+        "DeepSDF" if is_deepsdf else activation.upper()
+    )
+    return method, choices.get("normals", "?")
 
 
 def _short(value: str) -> str:
@@ -231,14 +221,17 @@ def _short(value: str) -> str:
 
 def table_csv(groups: list[Group]) -> str:
     """Every row of every group as numbers: a line a role, `Group.statistics` and `Group.costs` in it."""
-    frames = []
+    frames = [pd.DataFrame({"label": []})]
     for group in groups:
-        for row in group.rows:
-            known = {"method": row.method, "normals": row.normals, "detail": row.detail, "label": row.label}
-            known |= {"searched": row.searched, "cells": len(row.cells)}
-            line = pd.DataFrame([_place(group) | known | {"role": role} for role in ROLES])
-            frames.append(line.join(group.statistics, on=["label", "role"]).join(group.costs, on="label"))
-    return pd.concat(frames).to_csv(index=False, float_format="%.7g") if frames else ""
+        rows = [
+            _place(group) | vars(row) | {"label": row.label, "searched": row.searched} for row in group.rows
+        ]
+        rows = [row | {"cells": len(row["cells"]), "role": role} for row in rows for role in ROLES]
+        numbers = (
+            pd.DataFrame(rows).join(group.statistics, on=["label", "role"]).join(group.costs, on="label")
+        )
+        frames.append(numbers)
+    return pd.concat(frames[1:] or frames).to_csv(index=False, float_format="%.9g")
 
 
 def shapes_csv(groups: list[Group]) -> str:
@@ -247,12 +240,13 @@ def shapes_csv(groups: list[Group]) -> str:
     No `cd` where there is no surface, whose excess counts the CD of a single point.
     """
     frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
-    frame = pd.concat(frames) if frames else pd.DataFrame({"cd": [], "no_surface": []})
-    frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)
-    return frame.to_csv(index=False, float_format="%.7g")
+    frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
+    return frame.assign(cd=frame["cd"].where(frame["no_surface"] != 1)).to_csv(
+        index=False, float_format="%.9g"
+    )
 
 
 def _place(group: Group) -> dict[str, str]:
     """What tells a group from others, by column of a CSV file."""
-    settings = ";".join(f"{key}={value}" for key, value in (group.judging | group.shared).items())
-    return {name: group.choices.get(name, "") for name in JUDGING_GROUPS} | {"settings": settings}
+    settings = [f"{key}={value}" for key, value in group.judging.items() if key not in JUDGING_GROUPS]
+    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {"settings": ";".join(settings)}

@@ -22,10 +22,10 @@ QUANTITIES = {
 
 ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings of "
-    "the truth. Shapes without a surface count with the CD of a single point. Normals: mean |cos| between those "
-    "of the reconstruction and of the truth, of shapes with a surface. The floor is a mean over shapes: that of "
-    "a single shape, and so a median CD, may lie below it. ± is a 95% confidence interval over seeds "
-    "(Student's t); bold: the lowest, however near others are."
+    "the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| between "
+    "those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: a median CD "
+    "may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest, however near "
+    "others are."
 )
 ABOUT_DISTANCES = (
     "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
@@ -65,7 +65,9 @@ def tables(group: Group) -> list[Table]:
 
 
 def overview(groups: list[Group]) -> list[Table]:
-    """Mean and median excess of every row in every group, a table a role."""
+    """Mean and median excess of every row in every group, a table a role; none where there is one group."""
+    if len(groups) < 2:
+        return []
     common = set.intersection(*(set(group.title_parts) for group in groups))
     labels = dict.fromkeys(row.label for group in groups for row in group.rows)
     found = []
@@ -112,8 +114,6 @@ def _scores(group: Group, role: str) -> Table | None:
     )
     columns["normals"] = _texts(lines, "normal_consistency_mean", places=3)
     columns["no surface"] = [NONE if pd.isna(lost) else f"{lost:.0f}/{of:.0f}" for lost, of in counts]
-    shared = ", ".join(f"{key}={value}" for key, value in group.shared.items())
-    note = ABOUT_CD + (f" All rows with {shared}." if shared else "")
     lines = lines.reset_index(drop=True)
     rivals = lines[lines["no_surface"] < lines["shapes"]]  # without any surface CD is a penalty
     best = {
@@ -122,7 +122,7 @@ def _scores(group: Group, role: str) -> Table | None:
         if len(lines) > 1 and quantity != "floor_mean"  # the floor is no row's merit
         for row in rivals.index[rivals[quantity] == rivals[quantity].min()]
     }
-    return Table(TITLES[role], _frame(group, columns), note, best)
+    return Table(TITLES[role], _frame(group, columns), ABOUT_CD, best)
 
 
 def _distances(group: Group, role: str) -> Table | None:

@@ -17,7 +17,7 @@ from sdfhub.report.page import page
 from sdfhub.report.pictures import Gallery, Sheet
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
-from sdfhub.report.rows import Group, group_cells, shapes_csv, table_csv
+from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import latex, markdown, origin, overview, tables
 from sdfhub.tasks.app import first_word_as, run_task
 from sdfhub.tasks.build import build, check, plain
@@ -41,15 +41,14 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     Raises:
         SdfhubError: not a sweep's folder.
     """
-    cells = read_sweep(sweep)
+    cells, commands = read_sweep(sweep), read_plan(sweep).commands
     groups = group_cells(cells)
-    sections = [(group.title, tables(group)) for group in groups]
-    if len(groups) > 1:
-        sections.insert(0, ("All tables", overview(groups)))
-    text = "\n".join(markdown(title, found) for title, found in sections)
+    titles = ["All tables", *(group.title for group in groups), "Origin"]
+    found = [overview(groups), *map(tables, groups), [origin(commands, cells)]]
+    sections = [(title, some) for title, some in zip(titles, found, strict=True) if some]
+    text = "\n".join(markdown(title, some) for title, some in sections)
     print(f"\n{text}")
-    made = origin(read_plan(sweep).commands, cells)
-    write_whole(out / "table.md", f"# {sweep.name}\n\n{text}\n{markdown('Origin', [made])}")
+    write_whole(out / "table.md", f"# {sweep.name}\n\n{text}")
     write_whole(out / "table.tex", latex(sections))
     write_whole(out / "table.csv", table_csv(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
@@ -57,16 +56,18 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     sheets, turning = gallery.sheets(groups, shapes), gallery.turning(groups, shapes)
     for group, (sheet, _) in zip(groups, sheets, strict=True):
         write_sheet(sheet, out / f"{sheet_name(group)}.png")
-    write_whole(out / "report.html", page(sweep.name, cells, groups, made, sheets, turning))
+    write_whole(out / "report.html", page(sweep.name, cells, groups, found, sheets, turning))
     print(f"report: {out / 'report.html'}", flush=True)
     return cells
 
 
 def sheet_name(group: Group) -> str:
     """A name of its own for each group of a sweep."""
-    judging = ";".join(f"{key}={value}" for key, value in group.judging.items())
-    digest = [hashlib.sha256(judging.encode()).hexdigest()[:8]] if judging else []
-    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *group.choices.values(), *digest]))
+    choices = [group.judging[name] for name in JUDGING_GROUPS if name in group.judging]
+    settings = sorted(set(group.judging) - set(JUDGING_GROUPS))
+    said = ";".join(f"{key}={group.judging[key]}" for key in settings)
+    digest = [hashlib.sha256(said.encode()).hexdigest()[:8]] if said else []
+    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *choices, *digest]))
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
@@ -82,8 +83,7 @@ def truth_finder() -> FindTruth:
     stores: dict[str, Store | None] = {}
 
     def find(cell: Cell, id: str) -> StoredShape | None:
-        data = cell.scores.config.get("data", {})
-        key = str([data.get(name) for name in ("source", "preparation", "store")])
+        key = str(cell.scores.config.get("data"))
         if key not in stores:
             stores[key] = _store(cell.scores.config)
         store = stores[key]
