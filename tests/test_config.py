@@ -13,9 +13,7 @@ from tests.tiny import composed, run_command
 CONF = configuration_folder()
 OF_OTHER_TASKS = ("prior",)
 CHOICES = sorted(
-    (path.parent.name, path.stem)
-    for path in CONF.glob("*/*.yaml")
-    if path.parent.name not in OF_OTHER_TASKS
+    (path.parent.name, path.stem) for path in CONF.glob("*/*.yaml") if path.parent.name not in OF_OTHER_TASKS
 )
 
 
@@ -26,7 +24,11 @@ def parameters(*words: str) -> int:
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_choice_composes_and_builds(group, choice, tmp_path):
-    if group == "callbacks" and (CONF / "callbacks" / "default.yaml").read_text().find(choice) >= 0 and choice != "default":
+    if (
+        group == "callbacks"
+        and (CONF / "callbacks" / "default.yaml").read_text().find(choice) >= 0
+        and choice != "default"
+    ):
         words = []  # a part of the group, which default lists
     else:
         words = [f"{group}={choice}"]
@@ -60,7 +62,9 @@ def test_normals_off_asks_for_no_surface_points():
 
 
 def test_plain_groups_have_the_same_settings_in_every_row_and_experiments_say_their_own():
-    rows = [composed(f"activation={a}", f"encoding={e}") for a in ("siren", "relu") for e in ("none", "fourier")]
+    rows = [
+        composed(f"activation={a}", f"encoding={e}") for a in ("siren", "relu") for e in ("none", "fourier")
+    ]
     shared = [(row.optim, row.scale, row.loss, row.data.loader) for row in rows]
     assert all(settings == shared[0] for settings in shared) and not any(row.searched for row in rows)
     assert composed("experiment=fft_hosc").searched and composed("experiment=fft_hosc").optim != rows[0].optim

@@ -58,7 +58,12 @@ def mypkg(tmp_path, monkeypatch) -> Path:
 
 OWN = ["activation={_target_: mypkg.Snake, _partial_: true, a: 2}", "encoding._target_=mypkg.Radius"]
 OWN = ["~activation.omega_0", "~activation.omega_hidden", "~activation.beta", "~activation.learn_beta"]
-OWN += ["activation._target_=mypkg.Snake", "+activation.a=2", "encoding=none", "encoding._target_=mypkg.Radius"]
+OWN += [
+    "activation._target_=mypkg.Snake",
+    "+activation.a=2",
+    "encoding=none",
+    "encoding._target_=mypkg.Radius",
+]
 
 
 def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_exported_by_trust(
@@ -130,7 +135,12 @@ def test_a_config_folder_of_ones_own_adds_choices(mypkg, monkeypatch, tmp_path):
         "# @package _global_\ndefaults:\n  - override /activation: snake\nseed: 7\n"
     )
     run = train_tiny(
-        monkeypatch, tmp_path / "run", "callbacks=none", "--config-dir", str(tmp_path / "conf"), "experiment=mine"
+        monkeypatch,
+        tmp_path / "run",
+        "callbacks=none",
+        "--config-dir",
+        str(tmp_path / "conf"),
+        "experiment=mine",
     )
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert (config["activation"]["a"], config["seed"]) == (3, 7)

@@ -28,7 +28,7 @@ _MODULES = {
     "prepare_mesh": "sdfhub.data.preparation.sampling",
     "train": "sdfhub.training",
 }
-"""Where public names live; they are imported when they are first asked for, PyTorch with those that need it."""
+"""Where public names live. They are imported when they are first asked for: not all need PyTorch."""
 
 __all__ = sorted(_MODULES)
 

@@ -29,7 +29,9 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, MemoryError):
         return f"out of memory: {error}; lower resolution, points or samples"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)) or type(error).__name__
+    return (lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)) or type(
+        error
+    ).__name__
 
 
 def instantiate(config: Any, key: str, **given: Any) -> Any:
@@ -78,15 +80,6 @@ def plain(config: DictConfig) -> dict[str, Any]:
         return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     finally:
         OmegaConf.register_new_resolver("oc.env", oc.env, replace=True)
-
-
-def with_environment(node: Any) -> Any:
-    """Plain data with `${oc.env:NAME}` replaced by this machine's environment."""
-    if isinstance(node, Mapping):
-        return {name: with_environment(value) for name, value in node.items()}
-    if isinstance(node, str) and "${oc.env:" in node:
-        return OmegaConf.to_container(OmegaConf.create([node]), resolve=True)[0]
-    return node
 
 
 def with_absolute_paths(node: Any) -> Any:

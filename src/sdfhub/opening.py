@@ -13,6 +13,8 @@ metrics.json, metrics.csv, meshes/, contact_sheet.png, what the loggers write
 """
 
 import json
+import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +27,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, read_checkpoint
+from sdfhub.data.loading import SdfDataModule
+from sdfhub.described import built
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
 from sdfhub.shapes import Frame
@@ -127,6 +131,29 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
     return config, split
 
 
+def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:
+    """The data that a run's config describes.
+
+    Raises:
+        SdfhubError: it describes none, or names a class of a package that is not trusted.
+    """
+    if "data" not in config:
+        raise SdfhubError("the run's config.yaml says nothing of its data")
+    data = built(with_environment(config["data"]), "data", trust, within="sdfhub.data")
+    if not isinstance(data, SdfDataModule):
+        raise SdfhubError("the run's config.yaml describes no data")
+    return data
+
+
+def with_environment(node: Any) -> Any:
+    """Plain data with `${oc.env:NAME}` replaced by this machine's environment, "" where it has none."""
+    if isinstance(node, Mapping):
+        return {name: with_environment(value) for name, value in node.items()}
+    if not isinstance(node, str):
+        return node
+    return re.sub(r"\$\{oc\.env:(\w+)(?:,([^}]*))?\}", lambda m: os.environ.get(m[1], m[2] or ""), node)
+
+
 def beside(run: str, out: str | None, name: str) -> Path:
     """The folder of a task's results: `out`, or one in the run's folder or beside its file."""
     return Path(out) if out else (Path(run) if Path(run).is_dir() else Path(run).parent) / name
@@ -167,7 +194,11 @@ def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         codes = tensors.pop("codes")
         weights = {name.removeprefix("decoder."): tensor for name, tensor in tensors.items()}
-        return {key: about[key] for key in ("model", "config", "ids", "frames", "up", "metrics")}, weights, codes
+        return (
+            {key: about[key] for key in ("model", "config", "ids", "frames", "up", "metrics")},
+            weights,
+            codes,
+        )
     except SdfhubError:
         raise
     except Exception as error:  # the reader knows a dozen kinds of damage

@@ -8,11 +8,11 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import open_dict
 
+from sdfhub.composition import configuration_folder
 from sdfhub.described import trusted_packages
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import load
 from sdfhub.space import Space
-from sdfhub.composition import configuration_folder
 from sdfhub.tasks.train import train as train_into
 
 

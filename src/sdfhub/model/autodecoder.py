@@ -147,9 +147,6 @@ class AutoDecoder(L.LightningModule):
         named = {f"{role}/{name}": value for name, value in scores.items()}
         self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
 
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        return batch.to(device) if isinstance(batch, Batch) else batch  # a stored shape stays on the disk
-
     @property
     def progress(self) -> float:
         """Share of training done, in [0, 1]."""

@@ -45,7 +45,6 @@ def saved_decoder(
         SdfhubError: the weights are those of another decoder.
     """
 
-
     def make() -> Decoder:
         return built(description, "decoder", trust, within="sdfhub.model")
 
@@ -53,9 +52,7 @@ def saved_decoder(
     return decoder.eval().requires_grad_(False)
 
 
-def model_with_weights(
-    make: Callable[[], Model], description: Any, weights: Any, path: Path
-) -> Model:
+def model_with_weights(make: Callable[[], Model], description: Any, weights: Any, path: Path) -> Model:
     """A model with its weights. Nothing as large as the description says is made before the weights are as large.
 
     A few bytes of description could ask for a model without bounds.

@@ -12,12 +12,12 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
+from sdfhub.composition import plain
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import choices_of
 from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
 from sdfhub.report.results import read_scores
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
-from sdfhub.composition import plain
 from sdfhub.whole_file import write_whole
 
 Train = Callable[[DictConfig, Path], dict[str, Any]]

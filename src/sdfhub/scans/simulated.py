@@ -8,8 +8,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.preparation.visibility import points_on_faces
-from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.store.store import shape_seed
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe

@@ -2,24 +2,23 @@
 
 import logging
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
-from sdfhub.data.loading import SdfDataModule
+from sdfhub.composition import instantiate, plain
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
-from sdfhub.described import built, check
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import evaluate_model
-from sdfhub.opening import beside, load, read_run
-from sdfhub.composition import instantiate, plain, with_environment
+from sdfhub.opening import beside, data_of, load, read_run
 from sdfhub.tasks.app import run_task
+from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
 
 
-def evaluate_run(config: DictConfig) -> dict[str, Any]:
+def evaluate(config: DictConfig) -> None:
     """Judges a finished run again, as `config` says, into `out` or a folder `evaluation` of the run."""
     run = Path(str(config.run))
     out = beside(str(run), config.out, "evaluation")
@@ -38,27 +37,11 @@ def evaluate_run(config: DictConfig) -> dict[str, Any]:
     log.info("shapes: %d of the training, %d held out", len(roles.train), len(roles.held_out))
     shapes, held_out = data.prepared(roles)
     train = {roles_then["train"].index(shape.id): shape for shape in shapes}
-    delta = space.model["loss"]["delta"]
-    return evaluate_model(space.decoder, space.codes, space.delta, train, held_out, evaluation, out)
+    refuse_unwritable(out)
+    evaluate_model(space.decoder, space.codes, space.delta, train, held_out, evaluation, out)
 
 
-def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:
-    """The data that a run's config describes.
-
-    Raises:
-        SdfhubError: it describes none, or names a class of a package that is not trusted.
-    """
-    if "data" not in config:
-        raise SdfhubError("the run's config.yaml says nothing of its data")
-    data = built(with_environment(config["data"]), "data", trust, within="sdfhub.data")
-    if not isinstance(data, SdfDataModule):
-        raise SdfhubError("the run's config.yaml describes no data")
-    return data
-
-
-def choose_shapes(
-    source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig
-) -> Split:
+def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig) -> Split:
     """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
 
     Args:
@@ -95,8 +78,4 @@ def choose_shapes(
 
 def main() -> None:
     """Console entry: `sdfhub evaluate RUN evaluate.resolution=512`."""
-
-    def task(config: DictConfig) -> None:
-        evaluate_run(config)
-
-    run_task(task, "evaluate", positional=["run"])
+    run_task(evaluate, "evaluate", ["run"])

@@ -5,16 +5,19 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from omegaconf import DictConfig
 from pydantic import Field
 from tqdm import tqdm
 
+from sdfhub.composition import instantiate, plain
 from sdfhub.data.sources.source import unique_ids
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import beside, data_of, load, read_run
 from sdfhub.reconstruction.calibration import Calibration
 from sdfhub.reconstruction.reconstructor import Reconstructor
 from sdfhub.reconstruction.result import Limits, Result, is_result, table
@@ -24,11 +27,7 @@ from sdfhub.scans.simulated import ScanKind
 from sdfhub.shapes import NORMALIZED
 from sdfhub.space import Space
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import build, check, plain
-from sdfhub.opening import beside, load
-from sdfhub.tasks.prepare import stored_split
-from sdfhub.tasks.run import read_run, refuse_unwritable
-from sdfhub.tasks.words import take_words
+from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
 
@@ -58,19 +57,19 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     )
 
 
-def parts(config: dict[str, Any], space: Space) -> tuple[Reconstructor, Calibration]:
+def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]:
     """What the config names, made: how scans are fitted in a space, and how limits are found."""
     frame = scan_frame(space, config["frame"], check(config["of"], str | int | None, "of"))
-    poses = build(config["poses"], "poses", within="sdfhub.latent", up=space.up)
+    poses = instantiate(config.poses, "poses", up=space.up)
     reconstructor = Reconstructor(
         space,
-        fit=build(config["fit"], "fit", within="sdfhub.latent"),
-        evidence=build(config["evidence"], "evidence", within="sdfhub.scans"),
+        fit=instantiate(config.fit, "fit"),
+        evidence=instantiate(config.evidence, "evidence"),
         frame=frame,
         poses=poses if frame == "unknown" else None,
         resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
     )
-    return reconstructor, build(config["calibration"], "calibration", within="sdfhub.reconstruction")
+    return reconstructor, instantiate(config.calibration, "calibration")
 
 
 def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
@@ -97,25 +96,24 @@ def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
     return next(iter(frames.values()))
 
 
-def unseen_shapes(run: Path, data: dict[str, Any], count: int) -> list[StoredShape]:
+def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape]:
     """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source.
 
     Args:
         run: its folder.
-        data: keys that stand in for the run's own (store, workers).
+        config: of the task; its `data.store` and `data.workers` stand in for the run's own.
         count: how many.
     """
     trained, roles = read_run(run)
-    data = trained["data"] | {name: value for name, value in data.items() if value is not None}
-    source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-    offered = {shape.id: shape for shape in source.shapes()}
+    data = data_of(trained, config.trust or ())
+    data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
+    offered = {shape.id: shape for shape in data.source.shapes()}
     first = [offered[id] for id in roles["held_out"] if id in offered][:count]
     used = {*roles["train"], *roles["held_out"]}
-    others = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
-    others = [shape for shape in others if shape.split == "test"] or others
-    more = split(others, 0, min(count - len(first), len(others)), seed=0).test
-    return stored_split(source, Split([], first + more), preparation, data).held_out
+    rest = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
+    rest = [shape for shape in rest if shape.split == "held_out"] or rest
+    more = split(rest, 0, min(count - len(first), len(rest)), seed=0).held_out
+    return list(data.filled(Split([], first + more)))
 
 
 def limits_of(
@@ -123,36 +121,36 @@ def limits_of(
     reconstructor: Reconstructor,
     calibration: Calibration,
     kinds: Sequence[ScanKind],
-    config: dict[str, Any],
+    config: DictConfig,
 ) -> dict[ScanKind, Limits]:
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     if not calibration.shapes:
         return {}
-    settings = {key: config[key] for key in ("fit", "evidence", "calibration")}
-    settings["poses"] = config["poses"] if reconstructor.poses else None
+    settings = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
+    settings["poses"] = plain(config.poses) if reconstructor.poses else None
     try:
         return calibration.limits(
-            run, settings, kinds, reconstructor, lambda count: unseen_shapes(run, config["data"], count)
+            run, settings, kinds, reconstructor, lambda count: unseen_shapes(run, config, count)
         )
     except (SdfhubError, OSError, LookupError, TypeError) as error:  # an older run may lack anything
         log.warning("no verdicts: %s", error)
         return {}
 
 
-def reconstruct_run(config: dict[str, Any]) -> list[Result]:
+def reconstruct_run(config: DictConfig) -> list[Result]:
     """Finds the shapes behind `scans`, as `config` (conf/reconstruct.yaml) says."""
-    run = Path(check(config["run"], str, "run"))
-    out = beside(str(run), check(config["out"], str | None, "out"), "reconstructions")
-    sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
-    together = check(config["together"], Annotated[int, Field(ge=1)], "together")
-    files = scan_files(check(config["scans"], str | list[str], "scans"))
+    run, settings = Path(str(config.run)), plain(config)
+    out = beside(str(run), config.out, "reconstructions")
+    sensor = check(settings["sensor"], tuple[float, float, float] | None, "sensor")
+    together = check(settings["together"], Annotated[int, Field(ge=1)], "together")
+    files = scan_files(check(settings["scans"], str | list[str], "scans"))
     for name, path in files.items():
         result = out / f"{name}.ply"
         if result.resolve() == path.resolve() or (result.exists() and not is_result(result)):
             raise SdfhubError(
                 f"out={out}: the result of {path} would overwrite {result}; choose another folder"
             )
-    reconstructor, calibration = parts(config, load(run))
+    reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
     scans: dict[str, ObservedScan] = {}
     results: list[Result] = []
@@ -182,12 +180,12 @@ def report(results: Sequence[Result], out: Path) -> None:
         log.error("%s", result.reason)
 
 
+def reconstruct(config: DictConfig) -> None:
+    """The task: `config` as conf/reconstruct.yaml has it."""
+    if any(result.verdict == "failed" for result in reconstruct_run(config)):
+        sys.exit(1)
+
+
 def main() -> None:
     """Console entry: `sdfhub reconstruct RUN SCAN ...`. Exit status 1 if a scan failed."""
-    take_words("run", "scans...")
-
-    def task(config: DictConfig) -> None:
-        if any(result.verdict == "failed" for result in reconstruct_run(plain(config))):
-            sys.exit(1)
-
-    run_task(task, "reconstruct")
+    run_task(reconstruct, "reconstruct", ["run", "scans..."])

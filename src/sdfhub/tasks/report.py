@@ -12,6 +12,7 @@ from sdfhub.data.store.store import Store, preparation_hash
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.opening import data_of
 from sdfhub.report.meshes import FindTruth
 from sdfhub.report.page import page
 from sdfhub.report.pictures import Gallery, Sheet
@@ -19,10 +20,8 @@ from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import latex, markdown, origin, overview, tables
-from sdfhub.tasks.app import first_word_as, run_task
-from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.run import refuse_unwritable
-from sdfhub.whole_file import write_whole
+from sdfhub.tasks.app import run_task
+from sdfhub.whole_file import refuse_unwritable, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -94,38 +93,28 @@ def truth_finder() -> FindTruth:
 
 def _store(config: dict[str, Any]) -> Store | None:
     try:
-        data = config["data"]
-        source = build(data["source"], "data.source", within="sdfhub.data.sources")
-        preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-        store = Store.open(Path(data["store"]) / source.name / preparation_hash(preparation))
+        data = data_of(config)
+        store = Store.open(Path(data.store) / data.source.name / preparation_hash(data.preparation))
     except (SdfhubError, KeyError, TypeError, AttributeError):
         return None  # not on this machine: a report without ground truth
     for shape in store:
-        shape.up = source.up
+        shape.up = data.source.up
     return store
 
 
-def report(config: dict[str, Any]) -> None:
+def report(config: DictConfig) -> None:
     """The task: `config` as conf/report.yaml has it."""
-    sweep = Path(check(config["sweep"], str, "sweep"))
-    out = check(config["out"], str | None, "out")
-    shapes = check(config["shapes"], int, "shapes")
-    if shapes < 1:
-        raise SdfhubError(f"shapes={shapes}: must be at least 1")
-    folder = Path(out) if out else sweep / "report"
+    sweep = Path(config.sweep)
+    if config.shapes < 1:
+        raise SdfhubError(f"shapes={config.shapes}: must be at least 1")
+    folder = Path(config.out) if config.out else sweep / "report"
     read_plan(sweep)  # what is no sweep gets no folder
     refuse_unwritable(folder)
-    cells = write_report(sweep, folder, shapes)
-    failed = sum(cell.state == "failed" for cell in cells)
-    if failed:
+    cells = write_report(sweep, folder, config.shapes)
+    if failed := sum(cell.state == "failed" for cell in cells):
         log.warning("%d of %d cells failed; the command of the sweep tries them again", failed, len(cells))
 
 
 def main() -> None:
     """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    first_word_as("sweep")
-
-    def task(config: DictConfig) -> None:
-        report(plain(config))
-
-    run_task(task, "report")
+    run_task(report, "report", ["sweep"])

@@ -20,6 +20,7 @@ from sdfhub.callbacks.checkpoints import WholeFileIO
 from sdfhub.callbacks.progress import fitting_callbacks
 from sdfhub.callbacks.training_record import TrainingRecord
 from sdfhub.checkpoint_file import LAST
+from sdfhub.composition import instantiate, plain, with_absolute_paths
 from sdfhub.data.loading import SdfDataModule
 from sdfhub.described import located
 from sdfhub.errors import SdfhubError
@@ -33,7 +34,6 @@ from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.composition import instantiate, plain, with_absolute_paths
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
@@ -118,7 +118,9 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     torch.manual_seed(config.seed)
     model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
     model["optim"] = make_optimisation(config.optim)
-    model["validation"] = instantiate(config.get("validation"), "validation") if config.get("validation") else None
+    model["validation"] = (
+        instantiate(config.get("validation"), "validation") if config.get("validation") else None
+    )
     record = TrainingRecord()
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
@@ -164,7 +166,9 @@ def make_trainer(
         SdfhubError: names a setting that would give a wrong result, or that this machine cannot do.
     """
     if str(config.get("precision")) in WRONG_PRECISIONS:
-        raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use 32-true or bf16-mixed")
+        raise SdfhubError(
+            f"trainer.precision={config.precision}: needs a loss scale; use 32-true or bf16-mixed"
+        )
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
         raise SdfhubError(
             f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
@@ -172,7 +176,10 @@ def make_trainer(
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
-    ours |= {"plugins": [WholeFileIO()], "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks)}
+    ours |= {
+        "plugins": [WholeFileIO()],
+        "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks),
+    }
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     trainer = instantiate(config, "trainer", **given)
     for name in ("lightning.pytorch", "lightning.fabric"):  # through our handlers, into the run's log too
@@ -206,7 +213,14 @@ def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
     shapes = dict(enumerate(parts.data.train_shapes))
     codes = model.codes.table.detach()
     return evaluate_model(
-        model.decoder, codes, model.loss.delta, shapes, parts.data.held_out_shapes, parts.evaluation, folder, training
+        model.decoder,
+        codes,
+        model.loss.delta,
+        shapes,
+        parts.data.held_out_shapes,
+        parts.evaluation,
+        folder,
+        training,
     )
 
 

@@ -1,7 +1,6 @@
 """Plain words of a command line, such as `sdfhub reconstruct RUN scan.ply`, as Hydra's overrides."""
 
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,11 +39,6 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     if many:
         overrides[overrides.index(left[0])] = f"{left[0].removesuffix('...')}=[{','.join(many)}]"
     return overrides
-
-
-def take_words(*names: str) -> None:
-    """Turns the positional words of this process's command line into overrides."""
-    sys.argv[1:] = words_to_overrides(sys.argv[1:], names)
 
 
 def is_positional(word: str) -> bool:
