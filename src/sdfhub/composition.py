@@ -1,4 +1,4 @@
-"""From a composed config to objects and to plain data. What a user's own config names is made, whatever it is."""
+"""A composed config as objects and as plain data. Whatever the user's own config names is made."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -38,7 +38,13 @@ WHERE_NOT_WHAT += (
     "trainer.profiler",
     "trainer.num_sanity",
 )
-WHERE_NOT_WHAT += ("trainer.default_root_dir", "trainer.check_val", "trainer.val_check", "trainer.limit_val")
+WHERE_NOT_WHAT += (
+    "trainer.num_sanity",
+    "trainer.default_root_dir",
+    "trainer.check_val",
+    "trainer.val_check",
+    "trainer.limit_val",
+)
 """Beginnings of keys that say where a run happens and how it is watched: they change no result.
 
 Other callbacks count: one that stops a training early decides its result.

@@ -1,4 +1,4 @@
-"""A model from what a file holds: descriptions of its parts, and weights. Nothing is made before both agree."""
+"""A model from what a file holds: descriptions of its parts, and weights that agree with them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -53,7 +53,7 @@ def saved_decoder(
 
 
 def model_with_weights(make: Callable[[], Model], description: Any, weights: Any, path: Path) -> Model:
-    """A model with its weights. Nothing as large as the description says is made before the weights are as large.
+    """A model with its weights. Nothing is made that is larger than the weights.
 
     A few bytes of description could ask for a model without bounds.
 

@@ -26,7 +26,8 @@ def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> No
     Args:
         task: given each composed config.
         config_name: a YAML of conf/.
-        positional: keys that words without `=` stand for, in their order; the last may end with `...` and takes all that are left.
+        positional: keys that words without `=` stand for, in their order; a last one that ends with `...`
+            takes all that are left.
     """
     sys.argv[1:] = words_to_overrides(sys.argv[1:], positional)
     register_resolvers()

@@ -227,7 +227,7 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
     file = next((place for place in places if place.is_file()), Path(split) if split else None)
     if file is None:
         log.warning(
-            f"{folder}: its TrainSplit {specs.TrainSplit} is not here: shapes are numbered; or give split="
+            f"{folder}: TrainSplit {specs.TrainSplit} is not here: shapes are numbered; or give split="
         )
         return [f"shape/{row:05d}" for row in range(count)]
     names = list(names_listed(str(file), "train"))

@@ -25,9 +25,7 @@ def prepare(config: DictConfig) -> None:
     numbers = re.fullmatch(r"(\d+)/(\d+)", str(config.part))
     i, n = map(int, numbers.groups()) if numbers else (0, 0)
     if not 1 <= i <= n:
-        raise SdfhubError(
-            f"part={config.part}: must be i/n with 1 <= i <= n, such as part=1/4,2/4,3/4,4/4 with -m"
-        )
+        raise SdfhubError(f"part={config.part}: must be i/n with 1 <= i <= n, as in -m part=1/4,2/4,3/4,4/4")
     shapes, made = data.prepare_part(i, n)
     log.info("part %s: %d shapes, %d of them prepared now", config.part, shapes, made)
 

@@ -118,9 +118,8 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     torch.manual_seed(config.seed)
     model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
     model["optim"] = make_optimisation(config.optim)
-    model["validation"] = (
-        instantiate(config.get("validation"), "validation") if config.get("validation") else None
-    )
+    validation = config.get("validation")
+    model["validation"] = instantiate(validation, "validation") if validation else None
     record = TrainingRecord()
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
@@ -166,9 +165,7 @@ def make_trainer(
         SdfhubError: names a setting that would give a wrong result, or that this machine cannot do.
     """
     if str(config.get("precision")) in WRONG_PRECISIONS:
-        raise SdfhubError(
-            f"trainer.precision={config.precision}: needs a loss scale; use 32-true or bf16-mixed"
-        )
+        raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
         raise SdfhubError(
             f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
@@ -182,9 +179,15 @@ def make_trainer(
     }
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     trainer = instantiate(config, "trainer", **given)
-    for name in ("lightning.pytorch", "lightning.fabric"):  # through our handlers, into the run's log too
+    for name in (
+        "lightning",
+        "lightning.pytorch",
+        "lightning.fabric",
+    ):  # through our handlers, into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
+    for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
+        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
     return trainer
 
 
@@ -210,18 +213,9 @@ def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
     if not parts.record.stepped:
         log.info("the training was finished before (trainer.max_epochs would prolong it); judging")
     model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
-    shapes = dict(enumerate(parts.data.train_shapes))
-    codes = model.codes.table.detach()
-    return evaluate_model(
-        model.decoder,
-        codes,
-        model.loss.delta,
-        shapes,
-        parts.data.held_out_shapes,
-        parts.evaluation,
-        folder,
-        training,
-    )
+    train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
+    codes, delta = model.codes.table.detach(), model.loss.delta
+    return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
 
 
 def log_settings(trainer: Trainer, config: dict[str, Any]) -> None:
