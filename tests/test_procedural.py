@@ -29,10 +29,6 @@ def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.linalg.det(vertices[faces] - vertices.mean(0)).sum() / 6)
 
 
-def test_five_categories_are_on_offer():
-    assert set(CATEGORIES) == {"chairs", "lamps", "planes", "sofas", "tables"}
-
-
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_every_edge_is_shared_by_two_faces_that_run_along_it_in_opposite_directions(meshes, category):
     for vertices, faces in meshes[category]:
@@ -74,19 +70,6 @@ def test_a_thousand_designs_are_distinct_and_within_their_ranges(category):
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_built_shapes_are_distinct(meshes, category):
-    assert len({round(volume(*mesh), 9) for mesh in meshes[category]}) == len(SAMPLE)
-
-
-@pytest.mark.parametrize("category", CATEGORIES)
-def test_a_design_has_eight_continuous_and_two_discrete_parameters(category):
-    declared = fields(design(category, 0))
-    assert all(("range" in f.metadata) != ("options" in f.metadata) for f in declared)
-    assert sum(f.type is float for f in declared if "range" in f.metadata) >= 8
-    assert sum("options" in f.metadata for f in declared) >= 2
-
-
-@pytest.mark.parametrize("category", CATEGORIES)
 def test_every_parameter_moves_the_shape(category):
     for f in fields(design(category, 0)):
         assert any(_moves(category, i, f) for i in range(120)), f"{category}.{f.name} changes nothing"
@@ -110,12 +93,10 @@ def _moves(category: str, index: int, f) -> bool:
     return abs(before[0] - after[0]) > 1e-9 or before[1] != after[1]
 
 
-def test_an_unknown_category_is_refused_with_the_choices():
-    with pytest.raises(SdfhubError, match="chairs, lamps, planes, sofas, tables") as error:
-        generate("boats", 0)
-    assert "boats" in str(error.value) and "\n" not in str(error.value)
-
-
-def test_a_negative_index_is_refused():
-    with pytest.raises(SdfhubError, match="index=-1"):
-        generate("chairs", -1)
+@pytest.mark.parametrize(
+    "category, index, words",
+    [("boats", 0, "boats: .*choose chairs, lamps, planes, sofas, tables"), ("chairs", -1, "index=-1")],
+)
+def test_an_unknown_shape_is_refused_with_the_choices(category, index, words):
+    with pytest.raises(SdfhubError, match=words):
+        generate(category, index)

@@ -1,4 +1,4 @@
-"""What crosses the seams: a mesh, samples or an observation of a shape, a batch. Each is checked once, here.
+"""Data that parts of sdfhub hand to each other: meshes, samples, observations, batches; checked here, once.
 
 Frame: a shape's bounding-box centre lies at 0 and its farthest vertex at 1 / 1.03, so all of it lies
 in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
@@ -23,7 +23,7 @@ def check_id(id: str) -> None:
     """Refuses an id that is not safe as a path below a folder, such as `chairs/0007` is.
 
     Raises:
-        ValueError: says what an id may hold.
+        ValueError: lists the letters of an id.
     """
     if not isinstance(id, str) or not re.fullmatch(SHAPE_ID, id):
         raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
@@ -96,7 +96,7 @@ NORMALIZED = Frame(np.zeros(3), 1.0)
 
 
 class _InFrame:
-    """Centre and scale of what has a frame."""
+    """Centre and scale of data with a frame."""
 
     @property
     def center(self) -> np.ndarray:
@@ -127,7 +127,7 @@ class NormalizedMesh(_InFrame):
         _check("vertices", self.vertices, (None, 3), np.float64)
         _check("faces", self.faces, (None, 3), np.int64)
         reach = np.linalg.norm(self.vertices, axis=1).max(initial=0)
-        if not reach <= 1 + 1e-6:  # false for what is not finite
+        if not reach <= 1 + 1e-6:  # also where a vertex is not finite
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise ValueError("faces: index a vertex that is not there")

@@ -9,7 +9,7 @@ slope of the field in the cell; a cell whose nodes are all decided is skipped. O
 that no block decides are evaluated, and those of cells on which the sign changes. Nothing about a network
 guarantees an L: those trained with clamped distances say only "far" beyond the clamp, and may be steeper than
 1 or nearly flat. So L is measured from the samples around the cell, multiplied by a safety factor, and never
-below the slopes near the surface. What this still misses is grown back: wherever a sign change leaves the
+below the slopes near the surface. Missed cells are found by growing: wherever a sign change leaves the
 blocks, the neighbour joins them, and when an inferred sign proves wrong, all are evaluated again. So a
 connected piece of surface is found whole or not at all.
 """
@@ -197,11 +197,12 @@ def _evaluated_states(values: np.ndarray) -> np.ndarray:
 
 def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
     """[C, 2, 2, 2] whether the sign changes on the cells of blocks with nodes `outside` [C, 3, 3, 3]."""
-    some = every = outside  # of the corners of a cell
+    any_outside = all_outside = outside  # of the corners of a cell
     for axis in (1, 2, 3):
         low, high = [slice(None)] * axis + [slice(2)], [slice(None)] * axis + [slice(1, 3)]
-        some, every = some[tuple(low)] | some[tuple(high)], every[tuple(low)] & every[tuple(high)]
-    crossed = some != every
+        any_outside = any_outside[tuple(low)] | any_outside[tuple(high)]
+        all_outside = all_outside[tuple(low)] & all_outside[tuple(high)]
+    crossed = any_outside != all_outside
     for axis in (1, 2, 3):
         np.moveaxis(crossed, axis, 1)[:, 1] &= (2 * blocks[:, axis] + 1 < n - 1)[:, None, None]
     return crossed

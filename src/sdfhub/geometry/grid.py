@@ -90,12 +90,12 @@ class Grid:
         i = column // self.n
         return self.axis[torch.stack([i, column - i * self.n, keys - column * self.n], dim=-1)]
 
-    @torch.no_grad()  # not inference_mode: what a field caches must stay usable in training
+    @torch.no_grad()  # not inference_mode: tensors that a field caches must stay usable in training
     def _call(self, points: torch.Tensor, shapes: np.ndarray) -> np.ndarray:
         values = self.fields(points, torch.from_numpy(shapes).to(self.device))
         if values.shape != points.shape[:2]:
-            want = list(points.shape[:2])
-            raise ValueError(f"field: expected one value per point, {want}, got {list(values.shape)}")
+            wanted = list(points.shape[:2])
+            raise ValueError(f"field: expected one value per point, {wanted}, got {list(values.shape)}")
         values = values.detach().float().cpu().numpy()
         if not np.isfinite(values).all():
             bad = np.count_nonzero(~np.isfinite(values))

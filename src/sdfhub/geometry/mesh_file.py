@@ -10,7 +10,7 @@ from sdfhub.shapes import Mesh
 from sdfhub.whole_file import write_whole
 
 FORMATS = ("ply", "obj", "glb")
-"""What meshes can be written as."""
+"""Formats of written meshes."""
 
 FAR = 16
 """Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it: scans

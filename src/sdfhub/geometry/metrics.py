@@ -4,7 +4,7 @@ All meshes are (vertices [V, 3], faces [F, 3]) in one frame, the normalised one 
 Lengths are in that frame's units, Chamfer distances in their squares; nothing is multiplied by 10^3 here.
 
 A Chamfer distance between finite samples is never zero: two samplings of one surface differ by the *noise
-floor*, which grows with area and falls with the number of points. `excess` is what lies above it.
+floor*, which grows with area and falls with the number of points. `excess` is the rest of a distance.
 """
 
 from dataclasses import dataclass, fields
@@ -212,13 +212,13 @@ def summarize(rows: list[ShapeMetrics]) -> dict:
 
 def _sampled_metrics(samples: tuple, expected: tuple) -> dict[str, float]:
     """Chamfer distance and normal consistency of two pairs of points and normals."""
-    forth, partner = _nearest(samples[0], expected[0])
-    back, origin = _nearest(expected[0], samples[0])
+    to_expected, partner = _nearest(samples[0], expected[0])
+    to_samples, origin = _nearest(expected[0], samples[0])
     cosines = [
         np.abs(np.einsum("ij,ij->i", samples[1], expected[1][partner])).mean(),
         np.abs(np.einsum("ij,ij->i", expected[1], samples[1][origin])).mean(),
     ]
-    cd = np.mean(forth**2) + np.mean(back**2)
+    cd = np.mean(to_expected**2) + np.mean(to_samples**2)
     return {"cd": float(cd), "normal_consistency": float(np.mean(cosines))}
 
 
@@ -226,14 +226,14 @@ def _surface_metrics(
     samples: np.ndarray, mesh: Mesh, expected: np.ndarray, truth: Mesh, tau: float
 ) -> dict[str, float]:
     """Metrics from exact distances of samples to the other surface: they have no noise floor."""
-    forth, back = point_to_surface(samples, *truth), point_to_surface(expected, *mesh)
-    precision, recall = np.mean(forth < tau), np.mean(back < tau)
+    to_truth, to_mesh = point_to_surface(samples, *truth), point_to_surface(expected, *mesh)
+    precision, recall = np.mean(to_truth < tau), np.mean(to_mesh < tau)
     values = {
-        "point_to_surface": (forth.mean() + back.mean()) / 2,
-        "accuracy": forth.mean(),
-        "accuracy_p95": np.percentile(forth, 95),
-        "completeness": back.mean(),
-        "completeness_p95": np.percentile(back, 95),
+        "point_to_surface": (to_truth.mean() + to_mesh.mean()) / 2,
+        "accuracy": to_truth.mean(),
+        "accuracy_p95": np.percentile(to_truth, 95),
+        "completeness": to_mesh.mean(),
+        "completeness_p95": np.percentile(to_mesh, 95),
         "f_score": 2 * precision * recall / max(precision + recall, 1e-12),
     }
     return {name: float(value) for name, value in values.items()}

@@ -1,7 +1,7 @@
 """Long triangles cut into pieces: the same surface, in boxes that fit it more tightly.
 
-A tree over triangles prunes by their boxes, and a fast winding number sums up only what is compact: a chair's
-legs of long thin triangles make both look at nearly all of them.
+Trees over triangles prune by boxes, and fast winding numbers sum up compact groups: the long thin triangles
+of a chair's legs make both visit nearly all triangles.
 """
 
 import numpy as np

@@ -8,7 +8,7 @@ from sdfhub.errors import SdfhubError
 
 @dataclass(frozen=True)
 class Preparation:
-    """How many samples, where, signed by which method, and what is refused.
+    """Number, places and sign method of the samples, and the limits of a mesh.
 
     Source: DeepSDF (Park et al. 2019), section 5 and its published code, whose jitter variances are twice
     those of its paper; `min_*` and `max_*` are the limits beyond which `prepare_mesh` raises `RejectedMesh`.
@@ -75,4 +75,4 @@ class Preparation:
 
 
 DEFAULT = Preparation()
-"""What the paper's pipeline does, with the winding number for the sign."""
+"""The paper's pipeline, with the winding number for the sign."""

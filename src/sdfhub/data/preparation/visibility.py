@@ -1,7 +1,7 @@
 """Which faces of a mesh can be seen from outside, and from which of their sides.
 
-What no view sees is interior and goes; what is seen mostly from its back is turned round; what is seen
-from both sides is a sheet without an inside.
+Faces that no view sees are interior and dropped; faces seen mostly from their back are turned round; faces
+seen from both sides are sheets without an inside.
 """
 
 import os
@@ -24,7 +24,7 @@ from sdfhub.triangles import face_normals, piece_count
 os.environ.setdefault("IGL_NUM_THREADS", "1")
 
 FIRST, SECOND = 16, 48
-"""Rays at every face, and at those that the first ones leave open."""
+"""Rays at every face in the first round, and at undecided ones in the second."""
 RAYS = 1_500_000
 """Rays of a round above which a face gets fewer than that, down to half."""
 LARGE, AGAIN = 200_000, 3
@@ -78,31 +78,31 @@ def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sig
 
     Rays are aimed at points on the faces rather than spread over pictures: a small face is then judged by as
     many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
-    large ones more often; a second looks again at those that the first leaves open.
+    large ones more often; a second looks again at the undecided ones.
     """
     observer = _Observer(mesh, rng.permutation(sphere_directions(views)), rng)
     large = (observer.area / observer.area.sum() * LARGE).astype(np.int64)
-    observer.look(np.arange(len(large)), large + _fair(len(large), FIRST))
-    again = np.flatnonzero(_is_open(*observer.sums))
-    if len(again):
-        observer.look(again, AGAIN * large[again] + _fair(len(again), SECOND))
+    observer.look(np.arange(len(large)), large + _rays_per_face(len(large), FIRST))
+    undecided = np.flatnonzero(_is_undecided(*observer.sums))
+    if len(undecided):
+        observer.look(undecided, AGAIN * large[undecided] + _rays_per_face(len(undecided), SECOND))
     return Sightings(*(observer.sums[:2] / np.maximum(observer.sums[2], 1e-12)))
 
 
-def _fair(faces: int, most: int) -> int:
+def _rays_per_face(faces: int, most: int) -> int:
     return int(np.clip(RAYS // faces, most // 2, most))
 
 
-def _is_open(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarray:
-    """[F] whether too few sightings, or some of either side, leave undecided what a face is."""
+def _is_undecided(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarray:
+    """[F] whether a face has too few sightings, or some from either side."""
     return (front + back < SURE * cast) | (np.minimum(front, back) > 0)
 
 
 class _Observer:
-    """Rays from all around at the faces of one mesh, and the sums of what they have seen.
+    """Casts rays from all around at the faces of one mesh, and sums up the sightings.
 
     Args:
-        mesh: what is looked at.
+        mesh: the faces to look at.
         directions: [D, 3] towards the eye; a face takes them one after the other.
         rng: of the points on the faces and of each face's first direction.
     """
@@ -122,9 +122,9 @@ class _Observer:
         """Casts `rays` [S] rays, at least one, at each of `faces` [S]."""
         ends = np.cumsum(rays)
         bounds = np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK))
-        for some in np.split(np.arange(len(faces)), np.unique(bounds)):
-            if len(some):
-                self._look(faces[some], rays[some])
+        for chunk in np.split(np.arange(len(faces)), np.unique(bounds)):
+            if len(chunk):
+                self._look(faces[chunk], rays[chunk])
         self.next[faces] += rays
 
     def _look(self, faces: np.ndarray, rays: np.ndarray) -> None:

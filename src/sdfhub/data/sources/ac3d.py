@@ -64,7 +64,7 @@ class _Reader:
         return words
 
     def rows(self, count: int, columns: int) -> np.ndarray:
-        """[count, columns] numbers, one row a line; what follows on a line is left out."""
+        """[count, columns] numbers, one row a line; the rest of a line is left out."""
         if not 0 <= count <= len(self.content):
             raise ValueError(f"{count} rows cannot be in this file")
         rows = [self.line()[:columns] for _ in range(count)]

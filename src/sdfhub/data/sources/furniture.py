@@ -12,7 +12,7 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 CATALOGUE = "PluginFurnitureCatalog.properties"
 MAX_CATALOGUE = 16 << 20
 MAX_MODEL = 256 << 20
-"""Of one uncompressed model: what a small archive may claim to unpack to."""
+"""Bytes of one unpacked model: a small archive may claim any size."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _member_names(model: str) -> Iterator[str]:
 
 def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:
     with library.open(member) as file:
-        content = file.read(limit + 1)  # what its header says of its size is not to be trusted
+        content = file.read(limit + 1)  # the size in its header is not to be trusted
     if len(content) > limit:
         raise RejectedMesh("corrupt_file", f"{member} unpacks to more than {limit >> 20} MiB")
     return content

@@ -47,7 +47,7 @@ def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = N
     Args:
         content: the whole file.
         suffix: one of FORMATS.
-        name: what messages call it.
+        name: of the file in messages.
         folder: where a .gltf finds its buffers; None forbids other files.
     """
     if not content.strip():
@@ -65,7 +65,7 @@ def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = N
     except MemoryError:  # no fault of the file
         raise
     except Exception as error:  # trimesh raises whatever the broken bytes lead to
-        is_foreign = isinstance(error, ImportError)  # it would guess at the encoding of what is no text
+        is_foreign = isinstance(error, ImportError)  # it would guess the encoding of binary content
         why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
         raise RejectedMesh("corrupt_file", f"{name} cannot be read as {suffix[1:]} ({why})") from error
     _check_triangles(*mesh, name)

@@ -167,7 +167,7 @@ def _check_patterns(category: str, settings: dict) -> None:
 
 
 def _measured(model: _Model) -> dict:
-    """Faces, hash, and what tells twins: extents and area. A file that cannot be read has no faces."""
+    """Faces, hash, and extents and area, which twins share; a file that cannot be read has no faces."""
     try:
         vertices, faces = model.triangles()
     except RejectedMesh:
