@@ -77,7 +77,7 @@ def test_a_table_equals_what_is_computed_by_hand(small):
         "floor": "0.0500",
         "excess mean": f"0.4500 ± {half:.4f}",
         "excess median": f"0.4500 ± {half:.4f}",
-        "normals": "0.900",
+        "normals": "0.9000",
         "no surface": "0/6",
         "seeds": "2/2",
         "searched": "no",
@@ -105,7 +105,7 @@ def test_a_shape_without_a_surface_counts_with_its_penalty_and_is_counted(tmp_pa
     assert statistics["excess_median"] == pytest.approx(0.25)
     assert math.isnan(statistics["cd_mean_ci95"]), "one seed has no interval"
     table = tables_of(group)["Training shapes"].loc["SIREN + normals"]
-    assert (table["normals"], table["no surface"]) == ("0.900", "1/3"), "normals of those with a surface"
+    assert (table["normals"], table["no surface"]) == ("0.9000", "1/3"), "normals of those with a surface"
     assert {row for row, _ in tables(group)[0].best} == {0}, "a penalty is not the best"
     lines = list(csv.DictReader(io.StringIO(shapes_csv([group]))))
     assert [line["cd"] for line in lines] == ["0.1", "", "0.3", ""]

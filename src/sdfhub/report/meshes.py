@@ -39,23 +39,22 @@ def true_mesh(truth: StoredShape | None) -> Mesh | None:
     return Mesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
 
 
-def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> Mesh | None:
+def reconstruction(cell: Path, role: str, score: ShapeScore | None, truth: StoredShape | None) -> Mesh | None:
     """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
 
     Where the truth is not there to say what the frame was, the mesh's own extent does.
     """
     folder = cell / "meshes" / role
-    path = folder / f"{score.id}.ply"
-    if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
+    path = folder / f"{score.id}.ply" if score and not score.failed else folder
+    if not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
     try:
         with path.open("rb") as file:
             mesh = trimesh.load_mesh(file, file_type="ply", process=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        whole = np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)
+        if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
+            return None
     except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
-        return None
-    if not whole:
         return None
     if truth is None:
         center = (vertices.min(0) + vertices.max(0)) / 2

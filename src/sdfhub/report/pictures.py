@@ -72,31 +72,28 @@ class Gallery:
     def sheet(self, group: Group, count: int) -> Sheet:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
-        columns = [f"{id} ({'held out' if role == 'held_out' else role})" for role, id in shown]
-        first = next((row for row in group.rows if row.done), None)
-        rows = [("Ground truth", [self._truth_tile(first.done[0], id) for _, id in shown])] if first else []
+        cells = [row.first for row in group.rows if row.first]
+        rows = [("Ground truth", [self._truth_tile(cells[0], id) for _, id in shown])] if cells else []
         rows = [row for row in rows if any(tile.image is not None for tile in row[1])]
         for row in group.rows:
             absent = Tile(None, "failed" if any(cell.state == "failed" for cell in row.cells) else "missing")
-            tiles = [self._tile(row.done[0], role, id) if row.done else absent for role, id in shown]
-            rows.append((row.label, tiles))
-        return Sheet(columns, rows)
+            rows.append(
+                (row.label, [self._tile(row.first, *shape) if row.first else absent for shape in shown])
+            )
+        return Sheet([f"{id} ({role.replace('_', ' ')})" for role, id in shown], rows)
 
     def extremes(self, group: Group) -> Sheet:
         """Best, median and worst training shape of each row, the truth beside each."""
         rows = []
         for row in group.rows:
-            ranked = (
-                sorted(_scores(row.done[0], "train").values(), key=lambda s: s.excess) if row.done else []
-            )
-            if ranked:
-                ids = [shape.id for shape in (ranked[0], ranked[(len(ranked) - 1) // 2], ranked[-1])]
-                cell = row.done[0]
-                pairs = [(self._truth_tile(cell, id, id), self._tile(cell, "train", id)) for id in ids]
-                rows.append((row.label, [tile for pair in pairs for tile in pair]))
-        return Sheet(
-            [text for name in ("best", "median", "worst") for text in (f"{name}: truth", name)], rows
-        )
+            scores = _scores(row.first, "train").values() if row.first else []
+            ids = [score.id for score in sorted(scores, key=lambda score: score.excess)]
+            for_row = [ids[0], ids[(len(ids) - 1) // 2], ids[-1]] if ids else []
+            tiles = [
+                (self._truth_tile(row.first, id, id), self._tile(row.first, "train", id)) for id in for_row
+            ]
+            rows += [(row.label, [tile for pair in tiles for tile in pair])] if tiles else []
+        return Sheet(["best: truth", "best", "median: truth", "median", "worst: truth", "worst"], rows)
 
     def turning(self, groups: list[Group], count: int) -> list[list[dict]]:
         """Some shapes of each group, truth and rows, decimated for the viewer of the page.
@@ -104,25 +101,24 @@ class Gallery:
         Returns:
             A dict a shape: `name`, `role` and `panels`, its meshes as `packed` with a `label` each.
         """
-        room = MESH_BYTES // max(1, len(groups))
-        return [self._turning(group, chosen(group, min(count, TO_TURN)), room) for group in groups]
+        return [self._turning(group, min(count, TO_TURN), MESH_BYTES // len(groups)) for group in groups]
 
-    def _turning(self, group: Group, shown: list[tuple[str, str]], room: int) -> list[dict]:
-        rows = [row for row in group.rows if row.done]
+    def _turning(self, group: Group, count: int, room: int) -> list[dict]:
+        shown, rows = chosen(group, count), [row for row in group.rows if row.first]
         triangles = room // max(1, len(shown) * (len(rows) + 1) * 12)  # some 12 bytes each, as base64
         triangles = min(MOST, max(FEWEST, triangles))
-        found = []
+        shapes = []
         for role, id in shown:
-            meshes = [("Ground truth", true_mesh(self.find_truth(rows[0].done[0], id)))]
-            there = [row for row in rows if id in _scores(row.done[0], role)]
-            meshes += [(row.label, self._mesh(row.done[0], role, id)()) for row in there]
-            panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes if mesh]
-            found += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
-        return found
+            meshes = {"Ground truth": true_mesh(self.find_truth(rows[0].first, id))}
+            meshes |= {row.label: self._mesh(row.first, role, id)() for row in rows}
+            panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes.items() if mesh]
+            shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
+        return shapes
 
     def _mesh(self, cell: Cell, role: str, id: str) -> Callable[[], Mesh | None]:
         """Reads the reconstruction of a shape, in whatever process."""
-        return partial(reconstruction, cell.folder, role, _scores(cell, role)[id], self.find_truth(cell, id))
+        score = _scores(cell, role).get(id)
+        return partial(reconstruction, cell.folder, role, score, self.find_truth(cell, id))
 
     def _tile(self, cell: Cell, role: str, id: str) -> Tile:
         score = _scores(cell, role).get(id)

@@ -52,8 +52,8 @@ class ShapeScore(BaseModel, frozen=True):
     def measures(self) -> dict[str, float | None]:
         """What tables say of the shape, by name; distances times 10^3."""
         distances = {"cd": self.counted_cd, "floor": self.floor, "excess": self.excess}
-        scaled = {name: value * TABLE_UNIT for name, value in distances.items()}
-        return scaled | {"normal_consistency": self.normal_consistency, "no_surface": float(self.failed)}
+        counts = {"normal_consistency": self.normal_consistency, "no_surface": float(self.failed)}
+        return {name: value * TABLE_UNIT for name, value in distances.items()} | counts
 
 
 class DistanceScore(BaseModel, frozen=True):

@@ -55,9 +55,14 @@ class Row:
         return [cell for cell in self.cells if cell.scores]
 
     @property
+    def first(self) -> Cell | None:
+        """The first finished cell."""
+        return next(iter(self.done), None)
+
+    @property
     def searched(self) -> str:
         """What search the settings come from, as the experiment's config says: `no` where it says nothing."""
-        return str(self.done[0].scores.config.get("searched") or "no")[:200] if self.done else NONE
+        return str(self.first.scores.config.get("searched") or "no")[:200] if self.first else NONE
 
 
 @dataclass(frozen=True)

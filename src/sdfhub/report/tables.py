@@ -12,20 +12,21 @@ from sdfhub.report.rows import NONE, Group, Row, differing, settings_of
 
 TITLES = {"train": "Training shapes", "held_out": "Held-out shapes"}
 
-QUANTITIES = {
-    "CD mean": "cd_mean",
-    "CD median": "cd_median",
-    "floor": "floor_mean",
-    "excess mean": "excess_mean",
-    "excess median": "excess_median",
-}
+SURFACES = {"CD mean": "cd_mean", "CD median": "cd_median", "floor": "floor_mean"}
+SURFACES |= {"excess mean": "excess_mean", "excess median": "excess_median"}
+SURFACES |= {"normals": "normal_consistency_mean", "no surface": "no_surface"}
+DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_median"}
+DISTANCES |= {"signs right": "sign_accuracy_mean"}
+"""Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
+
+LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
 ABOUT_CD = (
-    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings of "
-    "the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| between "
-    "those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: a median CD "
-    "may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest, however near "
-    "others are."
+    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
+    "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
+    "between those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: "
+    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest, "
+    "however near others are."
 )
 ABOUT_DISTANCES = (
     "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
@@ -59,9 +60,9 @@ class Table:
 
 def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
-    found = [table(group, role) for role in ROLES for table in (_scores, _distances)]
-    found += [_settings(group), _costs(group), _absent(group)]
-    return [table for table in found if table]
+    kinds = [("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES)]
+    found = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
+    return [table for table in (*found, _settings(group), _costs(group), _absent(group)) if table]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -78,7 +79,7 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
             texts = zip(
-                _texts(lines, "excess_mean", 0), _texts(lines, "excess_median", 0), seeds, strict=True
+                _texts(lines, "excess_mean", False), _texts(lines, "excess_median", False), seeds, strict=True
             )
             texts = [NONE if mean == NONE else f"{mean}, {median}{n}" for mean, median, n in texts]
             columns.append(pd.Series(texts, name=", ".join(parts)))
@@ -104,48 +105,32 @@ def _lines(group: Group, role: str) -> pd.DataFrame:
     return lines.reindex([row.label for row in group.rows])
 
 
-def _scores(group: Group, role: str) -> Table | None:
+def _scores(group: Group, role: str, title: str, quantities: dict[str, str], about: str) -> Table | None:
     lines = _lines(group, role)
-    if lines["cd_mean"].isna().all():
+    if lines[next(iter(quantities.values()))].isna().all():
         return None
-    columns = {name: _texts(lines, quantity) for name, quantity in QUANTITIES.items()}
-    counts = zip(
-        lines["no_surface"] * lines["shapes_seeds"], lines["shapes"] * lines["shapes_seeds"], strict=True
-    )
-    columns["normals"] = _texts(lines, "normal_consistency_mean", places=3)
-    columns["no surface"] = [NONE if pd.isna(lost) else f"{lost:.0f}/{of:.0f}" for lost, of in counts]
+    columns = {name: _texts(lines, quantity) for name, quantity in quantities.items()}
+    if "no surface" in columns:
+        counts = lines[["no_surface", "shapes"]].mul(lines["shapes_seeds"], axis=0).to_numpy().tolist()
+        columns["no surface"] = [NONE if pd.isna(lost) else f"{lost:.0f}/{of:.0f}" for lost, of in counts]
     lines = lines.reset_index(drop=True)
     rivals = lines[lines["no_surface"] < lines["shapes"]]  # without any surface CD is a penalty
     best = {
         (int(row), column)
-        for column, quantity in enumerate(QUANTITIES.values(), start=1)
-        if len(lines) > 1 and quantity != "floor_mean"  # the floor is no row's merit
+        for column, quantity in enumerate(quantities.values(), start=1)
+        if len(lines) > 1 and quantity in LOWER_IS_BETTER
         for row in rivals.index[rivals[quantity] == rivals[quantity].min()]
     }
-    return Table(TITLES[role], _frame(group, columns), ABOUT_CD, best)
-
-
-def _distances(group: Group, role: str) -> Table | None:
-    lines = _lines(group, role)
-    if lines["sdf_error_mean"].isna().all():
-        return None
-    columns = {f"|f - d| {name}": _texts(lines, f"sdf_error_{name}") for name in ("mean", "median")}
-    columns["signs right"] = _texts(lines, "sign_accuracy_mean", places=4)
-    return Table(f"{TITLES[role]}, signed distances", _frame(group, columns), ABOUT_DISTANCES)
+    return Table(TITLES[role] + title, _frame(group, columns), about, best)
 
 
 def _settings(group: Group) -> Table | None:
     rows = [row for row in group.rows if row.done]
-    values = differing([settings_of(row.done[0]) for row in rows])
-    frame = pd.DataFrame([[key, *values[key]] for key in sorted(values)])
-    if frame.empty:
-        return None
-    return Table(
-        "Settings that differ",
-        frame.set_axis(["setting", *(r.label for r in rows)], axis=1),
-        ABOUT_SETTINGS,
-        prose=True,
+    lines = sorted(
+        (key, *values) for key, values in differing([settings_of(row.done[0]) for row in rows]).items()
     )
+    frame = pd.DataFrame(lines, columns=["setting", *(row.label for row in rows)])
+    return Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True) if lines else None
 
 
 def _costs(group: Group) -> Table:
@@ -179,13 +164,13 @@ def _seeds(row: Row) -> str:
     return f"{len(row.done)}/{len(row.cells)}" if row.done else "failed" if failed else "missing"
 
 
-def _texts(lines: pd.DataFrame, quantity: str, interval: float = 1, places: int | None = None) -> list[str]:
-    """A column with its intervals unless `interval` is 0, four places below 10 and two above by default."""
+def _texts(lines: pd.DataFrame, quantity: str, interval: bool = True) -> list[str]:
+    """A column as text with its intervals, four places below 10 and two above."""
     texts = []
-    for mean, half in zip(lines[quantity], lines[f"{quantity}_ci95"] * interval, strict=True):
-        digits = places or (4 if abs(mean) < 10 else 2)
-        spread = f" ± {half:.{digits}f}" if half >= 0.5 * 10**-digits else ""
-        texts.append(NONE if pd.isna(mean) else f"{mean:.{digits}f}{spread}")
+    for mean, half in zip(lines[quantity], lines[f"{quantity}_ci95"], strict=True):
+        places = 4 if abs(mean) < 10 else 2
+        spread = f" ± {half:.{places}f}" if interval and half >= 0.5 * 10**-places else ""
+        texts.append(NONE if pd.isna(mean) else f"{mean:.{places}f}{spread}")
     return texts
 
 
