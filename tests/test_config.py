@@ -6,7 +6,8 @@ from omegaconf import OmegaConf
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.composition import configuration_folder, instantiate, plain, with_environment
+from sdfhub.opening import with_environment
+from sdfhub.composition import configuration_folder, instantiate, plain
 from sdfhub.tasks.train import make_parts
 from tests.tiny import composed, run_command
 
