@@ -76,7 +76,7 @@ def reconstructed(run, *overrides):
     return task.reconstruct_run(composed(*quick, config_name="reconstruct"))
 
 
-def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path, caplog):
+def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path, capsys, caplog):
     results = reconstructed(run, f"scans={scans}", f"out={tmp_path}", "calibration.shapes=0")
     found = {each.name: each for each in results}
     assert {name: each.verdict for name, each in found.items()} == {
@@ -85,7 +85,8 @@ def test_what_can_be_read_is_reconstructed_in_its_own_frame(run, scans, tmp_path
         "oriented": "unjudged",
         "samples": "unjudged",
     }
-    assert "broken.xyz" in caplog.text and "passes over what is no scan: .txt" in caplog.text
+    assert "broken.xyz" in capsys.readouterr().err
+    assert "passes over what is no scan: .txt" in caplog.text
     for name, centre, radius in (("bare", 0, 0.45), ("oriented", 0, 0.5), ("samples", [100.0, 0, 0], 10.0)):
         mesh = trimesh.load_mesh(tmp_path / f"{name}.ply")
         assert np.abs(np.linalg.norm(mesh.vertices - centre, axis=1) / radius - 1).max() < 0.15
@@ -277,7 +278,7 @@ def test_a_mistake_is_one_line_that_names_it(run, scans, override, monkeypatch, 
         task.main()
     message = capsys.readouterr().err.strip().splitlines()[-1]
     assert stop.value.code == (1 if override.startswith("scans") else 2)
-    assert all(word in message for word in MISTAKES[override])
+    assert message.startswith("sdfhub: error: ") and all(word in message for word in MISTAKES[override])
 
 
 def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch, capsys):

@@ -62,15 +62,15 @@ class Fit(Protocol):
 def fit_groups(
     fit: Callable[[Sequence[Observation]], Fitted], observations: Sequence[Observation], device: torch.device
 ) -> Fitted:
-    """Fits B observations in groups: on a CPU one by one, elsewhere all of equal length at once.
+    """Fits B observations in groups: on a CPU one by one, elsewhere all that are alike at once.
 
     On a CPU each has a thread of its own, so that no neighbour changes even a rounding.
     """
     if is_cpu(device):
         return joined(side_by_side(lambda observation: fit([observation]), observations, least=1))
-    rows: dict[int, list[int]] = {}
+    rows: dict[tuple[int, bool], list[int]] = {}
     for row, observation in enumerate(observations):
-        rows.setdefault(len(observation.points), []).append(row)
+        rows.setdefault((len(observation.points), observation.is_exact), []).append(row)
     codes, residuals, poses = joined([fit([observations[row] for row in group]) for group in rows.values()])
     order = torch.tensor([row for group in rows.values() for row in group], device=device).argsort()
     poses = Similarity(*(part[order] for part in poses)) if poses else None

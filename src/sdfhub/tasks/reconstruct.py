@@ -177,7 +177,7 @@ def report(results: Sequence[Result], out: Path) -> None:
         # the result of an earlier command for a scan of this name stays
         if len(failed) < len(results) and not (out / f"{result.name}.json").exists():
             result.write(out)
-        log.error("%s", result.reason)
+        print(f"sdfhub: error: {result.reason}", file=sys.stderr)
 
 
 def reconstruct(config: DictConfig) -> None:
