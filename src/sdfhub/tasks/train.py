@@ -14,6 +14,7 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from pydantic import NonNegativeFloat
@@ -116,9 +117,13 @@ def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
     if not parts.trainer.is_global_zero:
         return {}
     metrics = judge(model, prepared, parts, run)
+    scores, step = final_scores(metrics), parts.trainer.global_step
     for logger in parts.trainer.loggers:
-        logger.log_hyperparams(flat(config))
-        logger.log_metrics(final_scores(metrics), parts.trainer.global_step)
+        if isinstance(logger, TensorBoardLogger):  # its table of runs
+            logger.log_hyperparams(flat(config), scores, step)
+        else:
+            logger.log_hyperparams(flat(config))
+            logger.log_metrics(scores, step)
     return metrics
 
 
