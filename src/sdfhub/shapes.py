@@ -6,10 +6,12 @@ in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 
 import re
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 RADIUS = 1 / 1.03
 """Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
@@ -226,13 +228,15 @@ class Batch:
         surface_normals: [B, M, 3] float32, unit length, outward.
     """
 
-    rows: torch.Tensor
-    points: torch.Tensor
-    sdf: torch.Tensor
-    surface_points: torch.Tensor
-    surface_normals: torch.Tensor
+    rows: "torch.Tensor"
+    points: "torch.Tensor"
+    sdf: "torch.Tensor"
+    surface_points: "torch.Tensor"
+    surface_normals: "torch.Tensor"
 
     def __post_init__(self):
+        import torch  # here: meshes and samples do without it
+
         b, n = self.points.shape[:2]
         m = self.surface_points.shape[1]
         _check("rows", self.rows, (b,), torch.int64)
