@@ -1,4 +1,4 @@
-"""Whether what is wrong about training shapes is their mirror image: of a symmetric family, some shapes are not.
+"""Whether what is wrong about trained shapes is their mirror image: of a symmetric family, some shapes are not.
 
     python benchmarks/mirrors.py RUN ...
 

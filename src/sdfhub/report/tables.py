@@ -25,8 +25,8 @@ ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
     "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
     "between those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: "
-    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest, "
-    "however near others are."
+    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the "
+    "lowest, however near others are."
 )
 ABOUT_DISTANCES = (
     "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
