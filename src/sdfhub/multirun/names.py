@@ -18,11 +18,16 @@ def register_resolvers() -> None:
     """Makes the functions that conf/ calls known to OmegaConf, here or in a launcher's worker."""
     for resolver in (run_name, run_stamp, sweep_name, cell_name, trials_done, trials_left):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-    OmegaConf.register_new_resolver("eighth", lambda count: max(1, int(count or 1) // 8), replace=True)
+    OmegaConf.register_new_resolver("eighth", eighth, replace=True)
     # Hydra hands cached values on from a multirun to its cells: `once` gives them all one folder
     OmegaConf.register_new_resolver("once", lambda value: value, use_cache=True, replace=True)
     # two runs that start in one second must not share a folder
     OmegaConf.register_new_resolver("unique", lambda: uuid.uuid4().hex[:4], use_cache=True, replace=True)
+
+
+def eighth(count: object) -> int:
+    """An eighth of a count, at least 1; 1 of what is no count."""
+    return max(1, count // 8) if isinstance(count, int) else 1
 
 
 def run_name(*, _root_: DictConfig) -> str:

@@ -5,7 +5,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import hydra
 import torch
@@ -15,14 +15,15 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 
 from sdfhub.callbacks.checkpoints import WholeFileIO
 from sdfhub.callbacks.progress import fitting_callbacks
 from sdfhub.callbacks.training_record import TrainingRecord
-from sdfhub.checkpoint_file import LAST
+from sdfhub.checkpoint_file import LAST, read_checkpoint
 from sdfhub.composition import instantiate, plain, with_absolute_paths
 from sdfhub.data.loading import SdfDataModule
-from sdfhub.described import located
+from sdfhub.described import check, located
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import Evaluation, evaluate_model
 from sdfhub.evaluation.made_with import made_with
@@ -38,6 +39,8 @@ from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
+
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
 """Half precision needs a loss scale; pieces of a batch are differentiated without one."""
@@ -76,6 +79,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
     parts, written = make_parts(config, folder), plain(config)
     refuse_processes_in_multirun(parts.trainer)
     if config.ckpt_path:
+        read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
     parts.data.prepare_data()
     parts.data.setup("fit")
@@ -115,7 +119,7 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     """
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
-    torch.manual_seed(config.seed)
+    torch.manual_seed(check(config.seed, Seed, "seed"))
     model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
     model["optim"] = make_optimisation(config.optim)
     validation = config.get("validation")
