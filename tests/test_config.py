@@ -56,7 +56,7 @@ def test_deepsdf_at_the_papers_scale_is_the_published_recipe():
     assert (config.trainer.max_epochs, config.evaluate.points) == (2000, 30_000)
     loader = config.data.loader
     assert (loader.shapes_per_step, loader.samples_per_shape, loader.passes_per_epoch) == (64, 16384, 1)
-    assert (config.evaluate.fit.steps, config.evaluate.fit.lr) == (800, 5e-3)
+    assert (config.fit.steps, config.fit.lr) == (800, 5e-3)
 
 
 def test_normals_off_asks_for_no_surface_points():

@@ -76,7 +76,7 @@ def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_expo
     with pytest.raises(SdfhubError, match=r"mypkg\.\w+.*trust=mypkg"):
         sdfhub.load(run)
     capsys.readouterr()
-    small = ["evaluate.resolution=24", "evaluate.points=500", "evaluate.fit.samples=500"]
+    small = ["evaluate.resolution=24", "evaluate.points=500", "fit.samples=500"]
     assert run_command(monkeypatch, str(run), *small, main=evaluate_task.main) == 2
     assert "trust=mypkg" in capsys.readouterr().err
     assert run_command(monkeypatch, str(run), *small, "trust=mypkg", main=evaluate_task.main) == 0
@@ -167,7 +167,7 @@ def test_a_run_is_judged_from_anywhere(monkeypatch, tmp_path):
     assert run_command(monkeypatch, *words, "callbacks=none", "hydra.run.dir=run", "data.store=my/store") == 0
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    small = ["evaluate.resolution=24", "evaluate.points=500", "evaluate.fit.samples=500"]
+    small = ["evaluate.resolution=24", "evaluate.points=500", "fit.samples=500"]
     assert run_command(monkeypatch, str(run), *small, main=evaluate_task.main) == 0
     assert not list((tmp_path / "elsewhere").rglob("*.safetensors")), "the store of the run was found"
 
