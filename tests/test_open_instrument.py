@@ -56,20 +56,14 @@ def mypkg(tmp_path, monkeypatch) -> Path:
     sys.modules.pop("mypkg", None)
 
 
-OWN = ["activation={_target_: mypkg.Snake, _partial_: true, a: 2}", "encoding._target_=mypkg.Radius"]
-OWN = ["~activation.omega_0", "~activation.omega_hidden", "~activation.beta", "~activation.learn_beta"]
-OWN += [
-    "activation._target_=mypkg.Snake",
-    "+activation.a=2",
-    "encoding=none",
-    "encoding._target_=mypkg.Radius",
-]
+OWN = ["activation=relu", "activation._target_=mypkg.Snake", "+activation.a=2"]
+OWN += ["encoding=none", "encoding._target_=mypkg.Radius"]
 
 
 def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_exported_by_trust(
     mypkg, monkeypatch, tmp_path, capsys
 ):
-    run = train_tiny(monkeypatch, tmp_path / "run", "callbacks=none", "activation=relu", *OWN[4:6], *OWN[6:])
+    run = train_tiny(monkeypatch, tmp_path / "run", "callbacks=none", *OWN)
     assert len(scores(run)) == 2
     space = sdfhub.load(run, trust="mypkg")
     assert type(space.decoder.activations[0]).__name__ == "Snake" and space.decoder.encoding.features == 4
@@ -134,14 +128,8 @@ def test_a_config_folder_of_ones_own_adds_choices(mypkg, monkeypatch, tmp_path):
     (tmp_path / "conf" / "experiment" / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /activation: snake\nseed: 7\n"
     )
-    run = train_tiny(
-        monkeypatch,
-        tmp_path / "run",
-        "callbacks=none",
-        "--config-dir",
-        str(tmp_path / "conf"),
-        "experiment=mine",
-    )
+    words = ["callbacks=none", "experiment=mine", "--config-dir", str(tmp_path / "conf")]
+    run = train_tiny(monkeypatch, tmp_path / "run", *words)
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert (config["activation"]["a"], config["seed"]) == (3, 7)
     searchpath = f"hydra.searchpath=[file://{tmp_path / 'conf'}]"
