@@ -17,9 +17,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from sdfhub.callbacks.checkpoints import StopOnSignal, WholeFileIO
 from sdfhub.checkpoint_file import read_checkpoint
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.run import build_autodecoder, read_weights
-from tests.test_config import composed
+from sdfhub.model.autodecoder import AutoDecoder
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed, read_weights
 
 STEPS, EPOCHS = 4, 3
 CONFIG = composed("decoder.width=16", "decoder.code_size=8", "decoder.dropout=0.1", "optim=step")
@@ -64,7 +64,7 @@ def trained(
     folder: Path, *callbacks, resume: Path | None = None, every=1, workers=0, epochs=EPOCHS, **settings
 ):
     """The module after a small training into `folder`."""
-    module = build_autodecoder(CONFIG, rows=4, steps=STEPS * EPOCHS)
+    module = build_autodecoder(CONFIG, rows=4)
     last = ModelCheckpoint(folder, "last", every_n_epochs=every, enable_version_counter=False)
     trainer = L.Trainer(
         accelerator="cpu",
@@ -270,5 +270,5 @@ def test_a_strangers_checkpoint_runs_no_code(tmp_path):
 def test_a_checkpoint_that_claims_more_numbers_than_it_holds_is_refused(tmp_path):
     claim = torch.zeros(1).expand(10**12, 8)
     torch.save({"state_dict": {"codes.table": claim}}, tmp_path / "last.ckpt")
-    with pytest.raises(SdfhubError, match="not a checkpoint of an auto-decoder"):
-        read_weights(tmp_path / "last.ckpt")
+    with pytest.raises(SdfhubError, match="holds no weights of a model"):
+        AutoDecoder.load_from_checkpoint(tmp_path / "last.ckpt")

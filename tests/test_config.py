@@ -1,14 +1,14 @@
-"""Every choice of conf/ composes and builds; what is wrong is refused in one line before a shape is prepared."""
+"""Every choice of conf/ composes and builds; mistakes are refused in one line, before a shape is prepared."""
 
 import pytest
 import torch
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from sdfhub.composition import configuration_folder, instantiate, plain
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.opening import with_environment
-from sdfhub.composition import configuration_folder, instantiate, plain
 from sdfhub.tasks.train import make_parts
 from tests.tiny import composed, run_command
 

@@ -24,8 +24,7 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate_run
-from sdfhub.tasks.run import build_autodecoder, read_weights
-from tests.test_config import composed
+from tests.tiny import build_autodecoder, composed, read_weights
 
 ROOT = Path(__file__).parents[1]
 OPEN = ROOT / "data" / "open"
@@ -323,7 +322,7 @@ def fit(module: L.LightningModule, batches, steps: int, callback: L.Callback, **
 def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
     choices = [f"activation={activation}", f"encoding={encoding}", f"normals={normals}"]
     config = composed(*choices, "~tuned")  # rates that a search found for thousands of steps are not for 60
-    module = build_autodecoder(config, rows=4, steps=60)
+    module = build_autodecoder(config, rows=4)
     config["trainer"]["max_epochs"] = 1
     losses = []
 

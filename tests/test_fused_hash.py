@@ -16,10 +16,9 @@ from sdfhub.model.encodings import Encoding, Fourier, Hash
 from sdfhub.model.fast import fused_hash
 from sdfhub.model.fast.computing import Computing
 from sdfhub.model.fast.fused_hash import FusedHash, fused
-from sdfhub.tasks.run import build_autodecoder
 from tests import twin_tinycudann
-from tests.test_config import composed
 from tests.test_training import FakeShape
+from tests.tiny import build_autodecoder, composed
 
 GPU = torch.device("cuda")
 GRIDS = {
@@ -91,7 +90,7 @@ def test_training_takes_it_and_leaves_nothing_of_it(installed, monkeypatch):
         monkeypatch.setattr(Computing, "quickest", lambda self, plain, _: quickest(self, plain, device))
         config = composed("experiment=hash_siren", "computing.compile=false")
         torch.manual_seed(0)
-        model = build_autodecoder(config, rows=2, steps=6)
+        model = build_autodecoder(config, rows=2)
         shapes = [FakeShape(0.4), FakeShape(0.6)]
         batches = StepBatches(shapes, Loading(2, 64, 16, passes_per_epoch=6))
         data = torch.utils.data.DataLoader(batches, batch_size=None)

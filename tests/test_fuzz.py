@@ -29,11 +29,12 @@ from sdfhub.data.sources.source import Shape
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import read_run
 from sdfhub.report.results import read_sweep
-from sdfhub.tasks.run import read_run, read_weights
 from tests.test_mesh_files import AC3D
 from tests.test_open_data import deb
 from tests.test_store import Balls, fill
+from tests.tiny import read_weights
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "0"))
 fuzzed = settings(

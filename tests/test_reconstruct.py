@@ -11,7 +11,10 @@ import pytest
 import torch
 import trimesh
 
+from sdfhub.checkpoint_file import LAST, write_checkpoint
+from sdfhub.composition import plain
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import begin_run
 from sdfhub.reconstruction import calibration as calibrations
 from sdfhub.reconstruction.calibration import Calibration
 from sdfhub.reconstruction.result import Limits, Result
@@ -22,10 +25,9 @@ from sdfhub.scans.scan import Scan
 from sdfhub.scans.simulated import ScanKind
 from sdfhub.shapes import NORMALIZED, Frame, NormalizedMesh
 from sdfhub.tasks import reconstruct as task
-from sdfhub.tasks.run import begin_run, build_autodecoder
-from tests.test_config import composed
 from tests.test_fitting import ball
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed
 
 SPACE = ["scale=demo", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
 SPACE += ["encoding=none", "data.preparation.samples=4000", "data.preparation.surface_points=2000"]
@@ -47,11 +49,10 @@ def run(tmp_path_factory):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    begin_run(
-        folder, config, [f"chairs/000{row}" for row in range(4)], ["chairs/0007", "chairs/0009"], {}, "z"
-    )
-    (folder / "checkpoints").mkdir()
-    torch.save({"state_dict": model.state_dict()}, folder / "checkpoints" / "last.ckpt")
+    train, held_out = [f"chairs/000{row}" for row in range(4)], ["chairs/0007", "chairs/0009"]
+    begin_run(folder, plain(config), train, held_out, {}, "z")
+    checkpoint = {"state_dict": model.state_dict(), "hyper_parameters": dict(model.hparams)}
+    write_checkpoint(checkpoint, folder / "checkpoints" / LAST)
     return folder
 
 

@@ -7,22 +7,18 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
-from sdfhub.latent.fitting import GaussNewtonFit
 from sdfhub.model.activations import Hosc, Siren
 from sdfhub.model.decoder import activated
 from sdfhub.model.dropout import drawn_from, dropout_factors
 from sdfhub.model.fast.computing import Computing, distances
 from sdfhub.model.fast.side_by_side import _pool, side_by_side
 from sdfhub.model.fast.waves import ALONE
-from sdfhub.tasks.run import build_autodecoder
-from tests.test_config import composed
-from tests.test_fitting import NEWTON, draws
 from tests.test_model import small_decoder
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed
 
 FORKED = """
 import os, torch
@@ -156,7 +152,7 @@ def test_a_step_on_several_threads_is_the_step_on_one(experiment, several):
     """With DeepSDF's dropout and its longest codes, too."""
     config = composed(f"experiment={experiment}", "decoder.width=300", "computing.points_at_once=70")
     torch.manual_seed(0)
-    model, batch = build_autodecoder(config, rows=5, steps=10), batches(per_step=5)[0]
+    model, batch = build_autodecoder(config, rows=5), batches(per_step=5)[0]
     codes, learned = 3 * model.codes.table.detach(), list(model.parameters())  # some are too long
 
     def found():
@@ -202,13 +198,3 @@ def test_distances_in_parts_are_those_of_the_decoder(shapes, count, several):
     points, codes = torch.rand(shapes, count, 3) - 0.5, torch.randn(shapes, 4)
     with torch.no_grad():
         torch.testing.assert_close(distances(decoder, points, codes), decoder(points, codes))
-
-
-def test_shapes_fitted_side_by_side_have_the_codes_that_each_has_alone(several):
-    torch.manual_seed(0)
-    decoder, fit = small_decoder(width=32), GaussNewtonFit(**NEWTON)
-    radii = np.linspace(0.4, 0.55, 5)
-    together = fit(decoder, draws(*radii), range(5))
-    each = [fit(decoder, draws(radius), [seed]) for seed, radius in enumerate(radii)]
-    assert torch.equal(together, torch.cat(each))
-    assert torch.equal(together, alone(lambda: fit(decoder, draws(*radii), range(5))))

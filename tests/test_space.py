@@ -16,8 +16,8 @@ import sdfhub
 import sdfhub.latent.gaussian
 import sdfhub.space
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Frame
 from sdfhub.opening import FORMAT, write_space
+from sdfhub.shapes import Frame
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
 
 
@@ -244,8 +244,9 @@ def test_a_file_holds_all_that_the_run_has(space, exported):
     points = torch.rand(50, 3) - 0.5
     assert again.ids == space.ids == tuple(IDS), "codes of augmented copies have no id"
     assert torch.equal(again.codes, space.codes) and torch.equal(again.sdf(points, 2), space.sdf(points, 2))
-    assert again.config == space.config and again.metrics == space.metrics and again.up == space.up
-    assert again.metrics["known"]["summary"]["cd"]["mean"] == 1.0
+    assert again.config == space.config and again.model == space.model
+    assert again.delta == space.delta and again.metrics == space.metrics and again.up == space.up
+    assert again.metrics["train"]["summary"]["cd"]["mean"] == 1.0
     assert np.array_equal(again.mesh(IDS[1], 16)[0], space.mesh(IDS[1], 16)[0])
     assert IDS[3] not in again.frames and again.frames[IDS[0]].scale == FRAME.scale
 
@@ -290,8 +291,8 @@ def test_a_folder_that_is_no_run_a_missing_one_and_a_device_that_is_not_there_ar
 
 def changed(space, change) -> tuple[dict, dict]:
     """Metadata and tensors of an export, changed by a function of its plain data and tensors."""
-    about = {"config": json.loads(json.dumps(space.config)), "ids": IDS, "frames": {}, "up": "z"}
-    about |= {"metrics": None}
+    about = json.loads(json.dumps({"model": space.model, "config": space.config}))
+    about |= {"ids": IDS, "frames": {}, "up": "z", "metrics": None}
     tensors = {f"decoder.{name}": tensor.clone() for name, tensor in space.decoder.state_dict().items()}
     tensors["codes"] = space.codes.clone()
     change(about, tensors)
@@ -299,18 +300,18 @@ def changed(space, change) -> tuple[dict, dict]:
 
 
 STRANGERS = {
-    "another class": (lambda a, t: a["config"]["decoder"].update(_target_="os.system"), "os.system"),
+    "another class": (lambda a, t: a["model"]["decoder"].update(_target_="os.system"), "os.system"),
     "a class of another part": (
-        lambda a, t: a["config"]["decoder"]["encoding"].update(_target_="sdfhub.model.codes.CodeTable"),
+        lambda a, t: a["model"]["decoder"]["encoding"].update(_target_="sdfhub.model.codes.CodeTable"),
         "not a class of sdfhub.model.encodings",
     ),
-    "an unknown setting": (lambda a, t: a["config"]["decoder"].update(evil=1), "decoder.evil"),
+    "an unknown setting": (lambda a, t: a["model"]["decoder"].update(evil=1), "decoder.evil"),
     "a decoder without end": (
-        lambda a, t: a["config"]["decoder"].update(depth=10**12),
+        lambda a, t: a["model"]["decoder"].update(depth=10**12),
         "more than a decoder",
     ),
     "a table without end": (
-        lambda a, t: a["config"]["decoder"].update(
+        lambda a, t: a["model"]["decoder"].update(
             encoding={
                 "_target_": "sdfhub.model.encodings.Hash",
                 "levels": 60,
@@ -322,14 +323,14 @@ STRANGERS = {
         ),
         "another model",
     ),
-    "a number that is none": (lambda a, t: a["config"]["decoder"].update(width="wide"), "decoder.width"),
-    "no decoder": (lambda a, t: a["config"].pop("decoder"), "not a shape space"),
+    "a number that is none": (lambda a, t: a["model"]["decoder"].update(width="wide"), "decoder.width"),
+    "no decoder": (lambda a, t: a["model"].pop("decoder"), "not a shape space"),
     "an activation that is no recipe": (
-        lambda a, t: a["config"]["decoder"]["activation"].update(_partial_=False),
+        lambda a, t: a["model"]["decoder"]["activation"].update(_partial_=False),
         "describes no decoder",
     ),
-    "a config that is a list": (lambda a, t: a.update(config=[]), "not a shape space"),
-    "another width": (lambda a, t: a["config"]["decoder"].update(width=31), "another model"),
+    "a model that is a list": (lambda a, t: a.update(model=[]), "not a shape space"),
+    "another width": (lambda a, t: a["model"]["decoder"].update(width=31), "another model"),
     "a weight too many": (
         lambda a, t: t.update({"decoder.more": torch.zeros(3)}),
         "decoder.*another model|more",

@@ -4,14 +4,17 @@ import json
 import sys
 from pathlib import Path
 
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
+from sdfhub.checkpoint_file import read_checkpoint
+from sdfhub.composition import configuration_folder, instantiate
+from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.tasks import train as train_task
-from sdfhub.composition import configuration_folder
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -52,7 +55,7 @@ def run_command(monkeypatch, *words: str, main=train_task.main) -> int:
 
 
 def train_tiny(monkeypatch, folder: Path, *words: str) -> Path:
-    """The run's folder of a training that ended well; its shapes are prepared once a test session's folder."""
+    """The run's folder of a training that ended well."""
     places = [f"hydra.run.dir={folder}", f"data.store={folder.parent / 'store'}"]
     bare = any(word.startswith(("callbacks=", "debug=")) for word in words)
     tiny = [word for word in TINY if not (bare and word.startswith("callbacks."))]
@@ -76,3 +79,17 @@ def composed(*words: str, config_name: str = "config") -> DictConfig:
 def scores(run: Path, role: str = "train") -> list[dict]:
     """The rows of `metrics.json` of a role."""
     return json.loads((run / "metrics.json").read_text())[role]["shapes"]
+
+
+def build_autodecoder(config: DictConfig, rows: int):
+    """The untrained model of a composed config."""
+    torch.manual_seed(config.seed)
+    names = ("decoder", "codes", "loss", "computing")
+    parts = {name: instantiate(config[name], name) for name in names}
+    optim = train_task.make_optimisation(config.optim)
+    return AutoDecoder(**parts, optim=optim, shapes=rows, seed=config.seed)
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The weights in a checkpoint."""
+    return read_checkpoint(path)["state_dict"]

@@ -23,8 +23,7 @@ from sdfhub.latent.problem import Prior, Problem, Rows
 from sdfhub.latent.similarity import PoseRange
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.losses import clamped_l1
-from sdfhub.tasks.run import build_autodecoder
-from tests.test_config import composed
+from tests.tiny import build_autodecoder, composed
 
 torch.utils.rename_privateuse1_backend("twin")
 GPU = torch.device("twin", 0)
@@ -54,7 +53,7 @@ class Stored:
 def model_of(experiment: str, *overrides: str) -> AutoDecoder:
     """A model for six shapes whose parameters and buffers are fakes on the device."""
     with torch._subclasses.fake_tensor.unset_fake_temporarily():
-        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6, steps=10)
+        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6)
     for module in model.modules():
         for name, parameter in module._parameters.items():
             if parameter is not None:

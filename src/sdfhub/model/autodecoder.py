@@ -154,6 +154,8 @@ class AutoDecoder(L.LightningModule):
 
     def configure_optimizers(self):
         self.steps = self.trainer.estimated_stepping_batches
+        # this has opened the data loader; a resumed training opens it again, once it knows its step
+        self.trainer.fit_loop._combined_loader = None
         if math.isinf(self.steps):
             raise SdfhubError(
                 "trainer.max_epochs: schedules and warm-ups are shares of a training; set it or max_steps"
