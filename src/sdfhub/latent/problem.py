@@ -95,11 +95,12 @@ class Problem:
         like = priors[0].codes.mean
         self.size = len(like)
         self.turns = torch.eye(3).to(like)[None]
-        narrow = torch.zeros(0, 0).to(like)
+        precisions = [torch.linalg.inv(prior.codes.covariance) for prior in priors]
         if poses:
             self.turns = turns(poses.turns, poses.up).to(like)
-            narrow = poses.spread().to(like).pow(-2).diag()
-        precisions = [torch.block_diag(torch.linalg.inv(prior.codes.covariance), narrow) for prior in priors]
+            narrow = torch.nn.functional.pad(poses.spread().to(like).pow(-2), (self.size, 0)).diag()
+            around = (0, SIZE, 0, SIZE)
+            precisions = [torch.nn.functional.pad(each, around) + narrow for each in precisions]
         weights = torch.tensor([prior.weight / self.size for prior in priors]).to(like)
         self.center = torch.stack([self.unknowns(prior.codes.mean) for prior in priors])  # [P, U]
         self.precision = torch.stack(precisions) * weights[:, None, None]  # [P, U, U]
