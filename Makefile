@@ -25,7 +25,7 @@ $(DEV_STAMP): $(STAMP)
 	@touch $@
 
 demo: install ## train HOSC + Fourier + normals on procedural chairs and print the Chamfer table (minutes)
-	$(BIN)/python train.py activation=hosc encoding=fourier scale=demo
+	$(BIN)/python train.py experiment=fft_hosc scale=demo
 
 test: $(DEV_STAMP) ## run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile

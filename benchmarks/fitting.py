@@ -21,15 +21,14 @@ from runs import ROOT, at_least, run_benchmark, train
 
 import sdfhub
 from sdfhub.data.loading.batches import signed_samples
-from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.splits import split
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.metrics import judge
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 from sdfhub.space import reconstruct
 from sdfhub.tasks.build import build
 from sdfhub.tasks.evaluate import Evaluation, fit_held_out
-from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.run import read_run
 
 FRESH = 40_000
@@ -39,11 +38,9 @@ FRESH = 40_000
 def unseen_shapes(space: Path, count: int) -> list[StoredShape]:
     """Shapes of the space's source that it was not trained on, prepared as its own were."""
     config, roles = read_run(space)
-    source = build(config["data"]["source"], "data.source", within="sdfhub.data.sources")
-    others = [shape for shape in source.shapes() if shape.id not in roles["train"]]
-    chosen = Split([], split(others, 0, count, seed=1).test)
-    preparation = build(config["data"]["preparation"], "data.preparation", within="sdfhub.data")
-    return stored_split(source, chosen, preparation, config["data"] | {"workers": 1}).held_out
+    data = build(config["data"] | {"workers": 1}, "data", within="sdfhub.data")
+    others = [shape for shape in data.source.shapes() if shape.id not in roles["train"]]
+    return list(data.filled(split(others, 0, count, seed=1)))
 
 
 def evaluation(fit: str, together: int, seed: int) -> Evaluation:

@@ -19,6 +19,7 @@ the peak resident set of the training process, libraries and all: `ru_maxrss` of
 """
 
 import argparse
+import dataclasses
 import os
 import shutil
 import statistics
@@ -37,7 +38,7 @@ from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.preparation.sampling import Preparation
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import split
-from sdfhub.data.store import shards, store
+from sdfhub.data.store import store, stored_shape
 from sdfhub.data.store.store import Store
 from sdfhub.model.fast.computing import keep_freed_memory
 
@@ -66,20 +67,20 @@ class Growth:
 def filled_store(real: int) -> Store:
     """The store of as many tables as the largest count, `real` of them prepared, the others copied."""
     source, preparation = ProceduralSource({"tables": {}}, count=COUNTS[-1]), Preparation()
-    shapes = split(source.shapes(), train=None, test=0, seed=0).train
+    shapes = split(source.shapes(), train=None, held_out=0, seed=0).train
     prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store"))
     folder = FOLDER / "store" / source.name / store.preparation_hash(preparation)
     for index, shape in enumerate(shapes[real:]):
-        if shards.read_record(folder / shape.id) is None:
-            copy_shape(prepared[index % len(prepared)], folder / shape.id, shape.fingerprint)
-    return store.prepare(source, shapes, preparation, FOLDER / "store")  # enters what the folders hold
+        path = folder / f"{shape.id}{stored_shape.SUFFIX}"
+        if not path.exists():
+            copy_shape(prepared[index % len(prepared)], path, shape.fingerprint)
+    return store.prepare(source, shapes, preparation, FOLDER / "store")
 
 
-def copy_shape(twin: shards.StoredShape, folder: Path, fingerprint: str) -> None:
+def copy_shape(twin: stored_shape.StoredShape, path: Path, fingerprint: str) -> None:
     """Writes the arrays of a prepared shape as those of another."""
-    names = [name for name in shards.COLUMNS if twin.rows(name)]
-    record = shards.read_record(twin.folder) | {"fingerprint": fingerprint}
-    shards.write_shape(folder, {name: twin.read(name, 0, twin.rows(name)) for name in names}, record)
+    arrays = {name: twin.read(name, 0, rows) for name in stored_shape.COLUMNS if (rows := twin.rows(name))}
+    stored_shape.write_shape(path, arrays, dataclasses.replace(twin.record, fingerprint=fingerprint))
 
 
 def trained(shapes: int, steps: int) -> Growth:

@@ -1,4 +1,4 @@
-"""Whether what is wrong about known shapes is their mirror image: of a symmetric family, some shapes are not.
+"""Whether what is wrong about trained shapes is their mirror image: of a symmetric family, some shapes are not.
 
     python benchmarks/mirrors.py RUN ...
 
@@ -35,7 +35,7 @@ def main() -> None:
             cell = Cell(plan, run, "done", "", read_scores(run))
         except SdfhubError as error:
             parser.error(f"{run}: {error}")
-        rows = [row for score in cell.scores.shapes.get("known", []) if (row := judged(cell, score, truth))]
+        rows = [row for score in cell.scores.shapes.get("train", []) if (row := judged(cell, score, truth))]
         if not rows:
             parser.error(f"{run}: the prepared shapes that it was trained on are not here")
         rows.sort(key=lambda row: -row[1])
@@ -54,7 +54,7 @@ def main() -> None:
 def judged(cell: Cell, score: ShapeScore, truth) -> tuple | None:
     """Id, excess, two asymmetries, strays, share of these in the mirror; None without truth or mesh."""
     shape = truth(cell, score.id)
-    mesh = reconstruction(cell.folder, "known", score, shape) if shape else None
+    mesh = reconstruction(cell.folder, "train", score, shape) if shape else None
     if mesh is None:
         return None
     surface = np.array(shape.surface[:POINTS, :3])

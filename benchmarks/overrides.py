@@ -92,7 +92,7 @@ def keys_and_groups() -> tuple[list[str], dict[str, list[str]]]:
     groups = {
         group: sorted(path.stem for path in (folder / group).glob("*.yaml"))
         for group in own
-        if group not in ("sweeps", "search")
+        if group not in ("sweeps", "hparams_search")
     }
     keys: dict[str, None] = {}
     with initialize_config_dir(str(folder), version_base="1.3"):

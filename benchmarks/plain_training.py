@@ -21,7 +21,8 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.model.decoder import Decoder, Layer
+from sdfhub.model.conditioning import Concat
+from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.pieces import Parts
 from sdfhub.shapes import Batch
 from sdfhub.tasks.train import main as train
@@ -36,7 +37,7 @@ def field(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
     encoded, copied = decoder.encoding(points), codes[:, None].expand(-1, points.shape[1], -1)
     hidden = encoded[..., :0]
     for layer, activation in zip_longest(decoder.layers, decoder.activations):
-        if type(layer) is not Layer:
+        if type(layer) is not Concat:
             raise SdfhubError("plain_training.py is written for conditioning=concat alone")
         _, reads_points, reads_code = layer.columns
         given = [hidden, encoded[..., :reads_points], copied[..., :reads_code]]

@@ -28,25 +28,24 @@ from hydra import compose, initialize_config_dir
 from runs import at_least, run_benchmark
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from sdfhub.scans.target import Target, observed
+from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
+from sdfhub.tasks.reconstructor import Found, Reconstructor
 
 from sdfhub.data.sources import ProceduralSource
-from sdfhub.data.splits import Split, split
-from sdfhub.data.store.shards import StoredShape
-from sdfhub.data.store.store import shape_seed
+from sdfhub.data.splits import split
+from sdfhub.data.store.store import prepare, shape_seed
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import judge, point_to_surface
 from sdfhub.geometry.render import render
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.scans.scan import Scan
-from sdfhub.scans.target import Target, observed
 from sdfhub.tasks.app import register_resolvers
 from sdfhub.tasks.build import build, plain
-from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
 from sdfhub.tasks.conf_files import configuration_folder
-from sdfhub.tasks.prepare import stored_split
 from sdfhub.tasks.reconstruct import limits_of, reconstructor
-from sdfhub.tasks.reconstructor import Found, Reconstructor
 from sdfhub.tasks.run import read_run
 
 KINDS = {
@@ -67,8 +66,8 @@ SEEN = 0.02
 def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     source = ProceduralSource({"lamps": {}})
     preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
-    chosen = Split([], split(source.shapes(), 0, count, seed=4).test)
-    return stored_split(source, chosen, preparation, trained["data"] | {"workers": 1}).held_out
+    shapes = split(source.shapes(), 0, count, seed=4).held_out
+    return list(prepare(source, shapes, preparation, trained["data"]["store"], workers=1))
 
 
 def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:

@@ -1,10 +1,11 @@
 """What searches for settings found: the best trials of each beside the defaults, trained alike.
 
-    python train.py -m search=fft_hosc scale=demo                  # a search, for each row
+    python train.py -m hparams_search=fft_hosc scale=demo                  # a search, for each row
     python train.py experiment=fft_hosc scale=demo hydra.run.dir=SWEEP_DIR/defaults
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
     python benchmarks/searches.py trials.csv --only demo_fft_hosc --best 2 --enqueue OTHER_DIR
-    python train.py -m search=fft_hosc scale=cpu search.trials=2 hydra.sweep.dir=OTHER_DIR  # tries them first
+    python train.py -m hparams_search=fft_hosc scale=cpu hparams_search.trials=2 \\
+        hydra.sweep.dir=OTHER_DIR  # tries them first
 
 A search's folder holds a folder of each training; that of the defaults, named `defaults`, is optional. A file
 that --csv wrote stands for the searches in it; of two searches of one name the later one counts. The
@@ -23,16 +24,16 @@ from statistics import mean, median
 from typing import NamedTuple
 
 from sdfhub.errors import SdfhubError
+from sdfhub.multirun.search import objective
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Scores, read_scores, read_sweep
 from sdfhub.settings import flat
-from sdfhub.tasks.search import objective
 from sdfhub.whole_file import write_whole
 
 KEYS = re.compile(r"(?:^|\s)['\"]?[+~]*([^\s='\"]+)")
 """Keys of a command's words, quoted or not, whole or cut."""
 
-SCORES = ("objective", "known", "known_median", "held_out", "held_out_median", "seconds")
+SCORES = ("objective", "train", "train_median", "held_out", "held_out_median", "seconds")
 
 
 class Trial(NamedTuple):
@@ -61,7 +62,7 @@ def judged(folder: Path, scores: Scores | None) -> dict[str, float | None]:
 def read_search(folder: Path) -> list[Trial]:
     """A search's finished and failed trials, the best first, then the defaults where they are there."""
     cells = [cell for cell in read_sweep(folder) if cell.state != "missing"]
-    if not all("search" in cell.plan.choices for cell in cells):
+    if not all("hparams_search" in cell.plan.choices for cell in cells):
         raise SdfhubError(f"{folder}: not a search; `sdfhub report` tells what a sweep found")
     said = [cell.plan.settings for cell in cells]
     everywhere = sorted(set.intersection(*map(set, said))) if said else []

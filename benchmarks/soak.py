@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from sdfhub.callbacks.checkpoints import LAST, read_checkpoint
+from sdfhub.checkpoint_file import LAST, read_checkpoint
 
 ROOT = Path(__file__).parents[1]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)

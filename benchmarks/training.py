@@ -49,7 +49,7 @@ WARM_UP = 2
 PUBLISHED, REFERENCE = "DeepSDF, as published", "DeepSDF, in our process"
 BUSY = 2.5
 """How much slower than in our process DeepSDF's step is in its own where it waits for other programs."""
-UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "search", "sweeps", "hydra")
+UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "hparams_search", "sweeps", "hydra")
 """Groups of a training that a step without data, judging or a loop around it does not read."""
 NAMED = ("decoder", "activation", "encoding", "normals", "experiment")
 """Groups whose choices the names of the rows say."""

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from sdfhub.checkpoint_file import LAST, write_checkpoint
+from sdfhub.composition import plain
 from sdfhub.model.losses import clamped_l1
+from sdfhub.opening import begin_run
 from sdfhub.shapes import Frame
-from sdfhub.tasks.run import begin_run, build_autodecoder
-from tests.test_config import composed
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed
 
 IDS = ["balls/small", "balls/medium", "balls/large", "balls/huge"]
 RADII = [0.4, 0.45, 0.5, 0.55]
@@ -34,8 +36,8 @@ def write_ball_run(run: Path) -> Path:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    begin_run(run, config, IDS, [], {id: FRAME for id in IDS[:3]}, "z")
-    (run / "checkpoints").mkdir()
-    torch.save({"state_dict": model.state_dict()}, run / "checkpoints" / "last.ckpt")
-    (run / "metrics.json").write_text(json.dumps({"known": {"summary": {"cd": {"mean": 1.0}}}}))
+    begin_run(run, plain(config), IDS, [], {id: FRAME for id in IDS[:3]}, "z")
+    checkpoint = {"state_dict": model.state_dict(), "hyper_parameters": dict(model.hparams)}
+    write_checkpoint(checkpoint, run / "checkpoints" / LAST)
+    (run / "metrics.json").write_text(json.dumps({"train": {"summary": {"cd": {"mean": 1.0}}}}))
     return run

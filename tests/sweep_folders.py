@@ -42,7 +42,7 @@ def score(id: str, cd: float | None, floor: float = 0.05e-3, penalty: float = 0.
 def write_cell(
     sweep: Path,
     cell: PlannedCell,
-    known: list[float | None] = (),
+    train: list[float | None] = (),
     held_out: list[float | None] = (),
     seconds: float = 100.0,
     parameters: int = 1000,
@@ -54,7 +54,7 @@ def write_cell(
     enter_cells(sweep, [cell])
     folder = sweep / cell.folder
     folder.mkdir(parents=True)
-    roles = {"known": list(known), "held_out": list(held_out)}
+    roles = {"train": list(train), "held_out": list(held_out)}
     shapes = {
         role: [score(ids.format(k + 100 * (role == "held_out")), cd) for k, cd in enumerate(values)]
         for role, values in roles.items()
@@ -69,11 +69,11 @@ def write_cell(
     }
     (folder / "config.yaml").write_text(yaml.safe_dump(written | (config or {})))
     split = {role: [row["id"] for row in rows] for role, rows in shapes.items()}
-    (folder / "split.json").write_text(json.dumps({"train": split["known"], "held_out": split["held_out"]}))
+    (folder / "split.json").write_text(json.dumps(split))
     return folder
 
 
-def write_mesh(folder: Path, id: str, role: str = "known", radius: float = 0.5) -> Path:
+def write_mesh(folder: Path, id: str, role: str = "train", radius: float = 0.5) -> Path:
     """A ball where a cell's reconstruction lies."""
     path = folder / "meshes" / role / f"{id}.ply"
     path.parent.mkdir(parents=True, exist_ok=True)

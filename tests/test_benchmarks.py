@@ -9,11 +9,10 @@ import pytest
 import torch
 from runs import train
 
+from sdfhub.composition import one_line
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.run import build_autodecoder
-from sdfhub.tasks.wording import one_line
-from tests.test_config import composed
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 MISTAKES = {
@@ -64,7 +63,7 @@ def test_a_step_is_that_of_the_plain_training(experiment, several):
     """What accuracy.py compares is the same objective: only how it is computed differs."""
     config = composed(f"experiment={experiment}", "decoder.dropout=0", "computing.points_at_once=70")
     torch.manual_seed(0)
-    model, batch = build_autodecoder(config, rows=5, steps=10), batches(per_step=5)[0]
+    model, batch = build_autodecoder(config, rows=5), batches(per_step=5)[0]
     have, want = (
         (loss, *parts.values(), *torch.autograd.grad(loss, list(model.parameters())))
         for loss, parts in (

@@ -12,13 +12,14 @@ from pathlib import Path
 import lightning as L
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
-from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
+from sdfhub.callbacks.checkpoints import StopOnSignal, WholeFileIO
 from sdfhub.checkpoint_file import read_checkpoint
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.run import build_autodecoder, read_weights
-from tests.test_config import composed
+from sdfhub.model.autodecoder import AutoDecoder
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed, read_weights
 
 STEPS, EPOCHS = 4, 3
 CONFIG = composed("decoder.width=16", "decoder.code_size=8", "decoder.dropout=0.1", "optim=step")
@@ -59,9 +60,12 @@ class Data(L.LightningDataModule):
         )
 
 
-def trained(folder: Path, *callbacks, resume: Path | None = None, every=1, workers=0, epochs=EPOCHS):
+def trained(
+    folder: Path, *callbacks, resume: Path | None = None, every=1, workers=0, epochs=EPOCHS, **settings
+):
     """The module after a small training into `folder`."""
-    module = build_autodecoder(CONFIG, rows=4, steps=STEPS * EPOCHS)
+    module = build_autodecoder(CONFIG, rows=4)
+    last = ModelCheckpoint(folder, "last", every_n_epochs=every, enable_version_counter=False)
     trainer = L.Trainer(
         accelerator="cpu",
         max_epochs=epochs,
@@ -69,8 +73,9 @@ def trained(folder: Path, *callbacks, resume: Path | None = None, every=1, worke
         enable_progress_bar=False,
         enable_model_summary=False,
         use_distributed_sampler=False,
-        callbacks=[*callbacks, *checkpointing(folder, every, None)],
+        callbacks=[*callbacks, StopOnSignal(folder), last],
         plugins=WholeFileIO(),
+        **settings,
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -90,23 +95,23 @@ def assert_same(module: L.LightningModule, weights: dict[str, torch.Tensor]) -> 
 
 @pytest.mark.parametrize("step", range(1, STEPS * EPOCHS + 1))
 def test_a_training_stopped_after_any_step_ends_bit_by_bit_like_an_undisturbed_one(
-    step, tmp_path, undisturbed, capfd
+    step, tmp_path, undisturbed, caplog
 ):
-    number = signal.SIGTERM if step % 2 else signal.SIGINT
+    number = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[step % 3]
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as stop:
         trained(tmp_path, At(step, lambda *_: os.kill(os.getpid(), number)))
     assert stop.value.code == 128 + number and signal.getsignal(number) == before
-    assert f"stopped after step {step}" in capfd.readouterr().out
+    assert f"stopped after step {step}" in caplog.text
     assert read_checkpoint(tmp_path / "last.ckpt")["global_step"] == step
     workers = 1 if step in (3, 8) else 0
     assert_same(trained(tmp_path / "rest", resume=tmp_path / "last.ckpt", workers=workers), undisturbed)
 
 
-def test_the_last_epoch_is_kept_though_it_is_not_one_of_every_n(tmp_path, undisturbed):
-    trained(tmp_path, every=2, epochs=1)
+def test_the_last_epoch_is_kept_though_it_is_not_one_of_every_n(tmp_path):
+    module = trained(tmp_path, every=2, epochs=1)
     assert read_checkpoint(tmp_path / "last.ckpt")["global_step"] == STEPS
-    assert_same(trained(tmp_path / "rest", resume=tmp_path / "last.ckpt"), undisturbed)
+    assert_same(module, read_checkpoint(tmp_path / "last.ckpt")["state_dict"])
 
 
 def test_a_slurm_job_that_runs_out_of_time_is_queued_again(tmp_path, monkeypatch, undisturbed):
@@ -118,6 +123,22 @@ def test_a_slurm_job_that_runs_out_of_time_is_queued_again(tmp_path, monkeypatch
         trained(tmp_path, At(6, lambda *_: os.kill(os.getpid(), signal.SIGUSR1)))
     assert stop.value.code == 143 and (tmp_path / "asked").read_text() == "requeue 77\n"
     assert_same(trained(tmp_path / "rest", resume=tmp_path / "last.ckpt"), undisturbed)
+
+
+def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        trained(tmp_path, At(2, lambda *_: os.kill(os.getpid(), signal.SIGHUP)), epochs=1)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert read_checkpoint(tmp_path / "last.ckpt")["global_step"] == STEPS
+
+
+def test_a_stop_waits_for_the_batches_whose_gradients_are_accumulated(tmp_path):
+    stops = At(0, lambda *_: os.kill(os.getpid(), signal.SIGTERM))  # with the first of two batches
+    with pytest.raises(SystemExit):
+        trained(tmp_path, stops, accumulate_grad_batches=2)
+    assert read_checkpoint(tmp_path / "last.ckpt")["global_step"] == 1
 
 
 def spoil(part: str):
@@ -174,6 +195,15 @@ def test_kills_while_checkpoints_are_written_leave_a_whole_one_and_no_pile(tmp_p
         table = read_checkpoint(path)["state_dict"]["codes.table"]
         assert (table == table[0, 0]).all() and table[0, 0] >= 1000 * kill, "the newest whole one"
         assert len(list(tmp_path.iterdir())) <= 2
+
+
+def test_a_link_in_the_place_of_a_checkpoint_or_its_part_is_not_followed(tmp_path):
+    (tmp_path / "other").write_text("precious")
+    for name in ("last.ckpt", ".checkpoint.part"):
+        (tmp_path / name).symlink_to(tmp_path / "other")
+    WholeFileIO().save_checkpoint(numbers(3), tmp_path / "last.ckpt")
+    assert (tmp_path / "other").read_text() == "precious"
+    assert read_checkpoint(tmp_path / "last.ckpt")["state_dict"]["codes.table"][0, 0] == 3
 
 
 def test_a_full_disk_names_the_file_and_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -240,5 +270,5 @@ def test_a_strangers_checkpoint_runs_no_code(tmp_path):
 def test_a_checkpoint_that_claims_more_numbers_than_it_holds_is_refused(tmp_path):
     claim = torch.zeros(1).expand(10**12, 8)
     torch.save({"state_dict": {"codes.table": claim}}, tmp_path / "last.ckpt")
-    with pytest.raises(SdfhubError, match="not a checkpoint of an auto-decoder"):
-        read_weights(tmp_path / "last.ckpt")
+    with pytest.raises(SdfhubError, match="holds no weights of a model"):
+        AutoDecoder.load_from_checkpoint(tmp_path / "last.ckpt")

@@ -12,12 +12,12 @@ import trimesh
 from PIL import Image
 
 import sdfhub
+from sdfhub.composition import instantiate
 from sdfhub.geometry.animation import animation
 from sdfhub.tasks import export, interpolate, neighbours, reconstruct, sample
 from sdfhub.tasks.export import as_function, function_file
-from sdfhub.tasks.run import build_decoder
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
-from tests.test_config import composed
+from tests.tiny import composed
 
 TINY = ["decoder.depth=2", "decoder.width=24", "decoder.code_size=4", "decoder.inject_code=[1]"]
 DECODERS = {
@@ -48,7 +48,7 @@ def told(monkeypatch, capsys, task, *words: str, expect: int = 0) -> str:
 @pytest.mark.parametrize("words", DECODERS.values(), ids=DECODERS)
 def test_an_exported_function_is_the_decoder_for_any_number_of_shapes_and_points(words):
     torch.manual_seed(0)
-    decoder = build_decoder(composed(*words, *TINY)["decoder"]).eval().requires_grad_(False)
+    decoder = instantiate(composed(*words, *TINY).decoder, "decoder").eval().requires_grad_(False)
     function = as_function(decoder)
     module = torch.export.load(io.BytesIO(function_file(function, "torch_export"))).module()
     ort = pytest.importorskip("onnxruntime")
@@ -180,7 +180,7 @@ def test_help_is_the_tasks_own_keys_and_what_they_mean(task, monkeypatch, capsys
 
 def test_help_tells_the_groups_of_a_task_and_no_others(monkeypatch, capsys):
     printed = told(monkeypatch, capsys, reconstruct, "--help")
-    assert "method: map # one of deepsdf, map" in printed and "\n  nearest: 3 " in printed
+    assert "fit: gauss_newton # one of deepsdf, gauss_newton" in printed and "\n  nearest: 3 " in printed
     assert "sensor: null # " in printed
     assert not {"activation:", "_target_", "hydra"} & set(printed.lower().split())
 

@@ -1,18 +1,34 @@
-"""Codes of unseen shapes: both ways of finding them, on a family of balls with a trained decoder."""
+"""Codes of observed shapes: both ways of finding them, on a family of balls with a trained decoder."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
-from sdfhub.latent.fitting import AdamFit, GaussNewtonFit, field_and_jacobian, initial_codes
+from sdfhub.errors import SdfhubError
+from sdfhub.latent.deepsdf_fit import DeepSdfFit
+from sdfhub.latent.fitting import frozen
+from sdfhub.latent.gauss_newton import GaussNewtonFit
+from sdfhub.latent.gaussian import Gaussian
+from sdfhub.latent.problem import Prior, Problem, Rows, violation
+from sdfhub.latent.similarity import PoseRange, small_similarity
 from sdfhub.model.losses import clamped_l1
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.observed_scan import observations_of
+from sdfhub.shapes import Observation
 from tests.test_model import small_decoder
 from tests.test_training import FakeShape, batches
 
-ADAM = {"steps": 100, "lr": 2e-2, "samples": 256, "spread": 0.01, "lambda_code": 1e-4, "delta": 0.1}
-NEWTON = {"steps": 20, "samples": 512, "thinning": 4, "tolerance": 3e-3, "smallest": 1e-3, "damping": 10.0}
-NEWTON |= {"spread": 0.01, "lambda_code": 1e-4, "delta": 0.1}
-FITS = {"adam": AdamFit(**ADAM), "gauss_newton": GaussNewtonFit(**NEWTON)}
+DELTA = 0.1
+NEWTON = GaussNewtonFit(samples=800, random=2, nearest=2, probes=64, thinning=4, steps=20)
+ADAM = DeepSdfFit(steps=100, lr=2e-2, per_step=256)
+FIT_FILES = ("fit/gauss_newton.yaml", "fit/deepsdf.yaml")
+FITS = {"gauss_newton": NEWTON, "deepsdf": ADAM}
+POSES = PoseRange(turns=4, tilt=15.0, scale=1.3, shift=0.3)
+CODES = torch.randn(6, 4, generator=torch.Generator().manual_seed(0)) * 0.5
 
 
 @pytest.fixture(scope="module")
@@ -24,113 +40,206 @@ def decoder():
     optimizer = torch.optim.Adam([*decoder.parameters(), codes], lr=5e-3)
     for step in range(250):
         batch = stream[step]
-        loss = clamped_l1(decoder(batch.points, codes[batch.rows]), batch.sdf, 0.1)
+        loss = clamped_l1(decoder(batch.points, codes[batch.rows]), batch.sdf, DELTA)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     return decoder
 
 
-def draws(*radii: float, samples: int = 512):
-    """What a fit asks for: a step's points [B, N, 3] and distances [B, N] of unseen balls, half inside."""
+def ball(radius: float, surface_only=False, noise=0.0, shift=0.0, count=800) -> Observation:
+    """Signed samples of a ball, or points on it and that the far outside is far."""
+    rng = np.random.default_rng(0)
+    away = rng.standard_normal((count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    size = radius + np.where(np.arange(count) % 2, 0, rng.uniform(-0.09, 0.3, count))
+    points = (size + noise * rng.standard_normal(count))[:, None] * away + shift
+    sdf = size - radius
+    low = np.where(sdf < 0, -0.2, sdf) if surface_only else sdf
+    high = np.maximum(sdf, 0.0) if surface_only else sdf
+    parts = (part.astype(np.float32) for part in (points, low, high))
+    return Observation(*parts, np.zeros(count, bool), noise)
 
-    balls = [FakeShape(radius) for radius in radii]
 
-    def draw(step: int):
-        chosen = [np.random.default_rng((step, side)).integers(0, 400, samples // 2) for side in range(2)]
-        rows = [np.concatenate([b.outside[chosen[0]], b.inside[chosen[1] % len(b.inside)]]) for b in balls]
-        drawn = torch.from_numpy(np.stack(rows))
-        return drawn[..., :3], drawn[..., 3]
-
-    return draw
+def rows(*shapes: Observation, smallest=1e-3, prior=1) -> Rows:
+    return Rows.of(shapes, smallest, [prior] * len(shapes), torch.device("cpu"))
 
 
-def objective(decoder, codes, points, sdf):
-    return clamped_l1(decoder(points, codes), sdf, 0.1) + 1e-4 * codes.square().mean()
+def error(decoder, code, observation) -> float:
+    with torch.no_grad(), frozen(decoder):
+        return float(violation(decoder, code[None], rows(observation), DELTA).abs().mean())
 
 
 @pytest.mark.parametrize("fit", FITS.values(), ids=FITS)
 def test_a_fit_finds_codes_of_unseen_shapes_and_leaves_the_decoder_alone(decoder, fit):
     decoder.train()
     before = {name: value.clone() for name, value in decoder.state_dict().items()}
-    fitted = fit(decoder, draws(0.47, 0.52), [0, 1])
-    points, sdf = draws(0.47, 0.52)(1000)
-    error = clamped_l1(decoder(points, fitted), sdf, 0.1)
-    assert error < 0.3 * clamped_l1(decoder(points, torch.zeros(2, 4)), sdf, 0.1)
-    assert error < 0.02
+    fitted = fit(decoder, CODES, [ball(0.47), ball(0.52)], DELTA)
+    for code, radius in zip(fitted.codes, (0.47, 0.52), strict=True):
+        away = error(decoder, code, ball(radius, count=900))
+        assert away < 0.01 and away < 0.5 * error(decoder, torch.zeros(4), ball(radius))
     assert all(torch.equal(before[name], value) for name, value in decoder.state_dict().items())
     assert all(parameter.requires_grad for parameter in decoder.parameters()) and decoder.training
-    assert not fitted.requires_grad
+    assert not fitted.codes.requires_grad and fitted.poses is None and (fitted.residuals < 0.02).all()
 
 
-@pytest.mark.parametrize(("fit", "tolerance"), [("adam", 1e-4), ("gauss_newton", 0)])
-def test_shapes_fitted_together_get_the_codes_they_get_alone(decoder, fit, tolerance):
-    radii, seeds = (0.45, 0.52, 0.48), (3, 4, 5)
-    together = FITS[fit](decoder, draws(*radii), seeds)
-    alone = [FITS[fit](decoder, draws(radius), [seed]) for radius, seed in zip(radii, seeds, strict=True)]
-    assert torch.allclose(together, torch.cat(alone), rtol=0, atol=tolerance)
+def test_the_surface_of_a_ball_is_enough(decoder):
+    seen = [ball(0.48, surface_only=True), ball(0.5, noise=0.01)]
+    fitted = NEWTON(decoder, CODES, seen, DELTA)
+    assert max(map(error, [decoder] * 2, fitted.codes, [ball(0.48), ball(0.5)])) < 0.02
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("deepsdf", 1e-4), ("gauss_newton", 0)])
+def test_shapes_fitted_together_get_what_they_get_alone(decoder, several, name, tolerance):
+    seen, fit = [ball(0.45), ball(0.52, noise=0.01), ball(0.5, count=600)], FITS[name]
+    together = fit(decoder, CODES, seen, DELTA)
+    for row, observation in enumerate(seen):
+        alone = fit(decoder, CODES, [observation], DELTA)
+        assert torch.allclose(together.codes[row], alone.codes[0], rtol=0, atol=tolerance)
+        assert torch.allclose(together.residuals[row], alone.residuals[0], rtol=0, atol=tolerance)
+
+
+def test_shapes_in_one_batch_get_what_they_get_one_by_one(decoder, monkeypatch):
+    seen = [ball(0.45), ball(0.5, count=600), ball(0.52)]
+    one_by_one = NEWTON(decoder, CODES, seen, DELTA)
+    monkeypatch.setattr("sdfhub.latent.fitting.is_cpu", lambda device: False)
+    batch = NEWTON(decoder, CODES, seen, DELTA)
+    assert torch.allclose(batch.codes, one_by_one.codes, atol=1e-3)
 
 
 def test_a_shape_without_numbers_does_not_harm_its_neighbour(decoder):
-    def broken(step):
-        points, sdf = draws(0.45, 0.5)(step)
-        sdf[0] = torch.nan
-        return points, sdf
-
-    start = initial_codes(decoder, NEWTON["spread"], [3])
-    fitted = FITS["gauss_newton"](decoder, broken, [3, 4])
-    assert torch.equal(fitted[:1], start)
-    assert torch.allclose(fitted[1:], FITS["gauss_newton"](decoder, draws(0.5), [4]), atol=1e-5)
-
-
-def test_shapes_fitted_in_one_batch_get_the_codes_they_get_alone(decoder):
-    fit = FITS["gauss_newton"]
-    start, (points, sdf) = initial_codes(decoder, 0.01, [3, 4, 5]), draws(0.45, 0.52, 0.48)(0)
-    together = fit._fit(decoder, start, points, sdf)  # as on a GPU
-    assert torch.allclose(together, fit(decoder, lambda step: (points, sdf), [3, 4, 5]), atol=1e-4)
+    broken = ball(0.45)
+    broken.points[:] = np.nan
+    fitted = NEWTON(decoder, CODES, [broken, ball(0.5)], DELTA)
+    assert torch.equal(fitted.codes[1], NEWTON(decoder, CODES, [ball(0.5)], DELTA).codes[0])
 
 
 def test_gauss_newton_reaches_adams_minimum(decoder):
-    radii = (0.43, 0.47, 0.52, 0.54)
-    fresh = draws(*radii, samples=2000)(1000)
-    long = AdamFit(**ADAM | {"steps": 250})(decoder, draws(*radii), range(4))
-    short = FITS["gauss_newton"](decoder, draws(*radii), range(4))
-    with torch.no_grad():
-        for shape in range(4):
-            part = [tensor[shape : shape + 1] for tensor in fresh]
-            values = [objective(decoder, codes[shape : shape + 1], *part) for codes in (short, long)]
-            assert values[0] < 1.05 * values[1] + 1e-5
+    long = replace(ADAM, steps=250)
+
+    def objective(code, observation):
+        return error(decoder, code, observation) + 1e-4 * float(code.square().mean())
+
+    for radius in (0.43, 0.47, 0.52, 0.54):
+        fresh = ball(radius, count=2000)
+        quick, slow = (fit(decoder, CODES, [ball(radius)], DELTA).codes[0] for fit in (NEWTON, long))
+        assert objective(quick, fresh) < 1.05 * objective(slow, fresh) + 1e-4
 
 
-def test_the_jacobian_is_that_of_each_sample(decoder):
-    points, codes = torch.rand(2, 5, 3) - 0.5, torch.randn(2, 4)
-    field, jacobian = field_and_jacobian(decoder, points, codes)
-    assert torch.allclose(field, decoder(points, codes), atol=1e-6)
-    every = torch.autograd.functional.jacobian(lambda z: decoder(points, z), codes)  # [B, N, B, L]
-    for shape in range(2):
-        assert torch.allclose(jacobian[shape], every[shape, :, shape], atol=1e-5)
+def test_more_starts_never_end_higher(decoder):
+    """On the rows that starts see, which here are all."""
+    how = replace(NEWTON, thinning=1, blurred=1e-3, tolerance=1e-5)
+    seen, flat = [ball(0.47, surface_only=True)], replace(how, weight=0.0)
+    few = replace(flat, random=0, nearest=0)(decoder, CODES, seen, DELTA)
+    many = replace(flat, random=4, nearest=4)(decoder, CODES, seen, DELTA)
+    assert many.residuals[0] <= few.residuals[0] + 1e-4
 
 
-def test_the_quadratic_has_the_objectives_value_and_gradient(decoder):
-    points, sdf = draws(0.45)(0)
-    codes = torch.full((1, 4), 0.3, requires_grad=True)
-    fit = GaussNewtonFit(**NEWTON | {"smallest": 1e-9})  # |r| everywhere, as in the objective
-    value = objective(decoder, codes, points, sdf)
-    (gradient,) = torch.autograd.grad(value, codes)
-    about = fit._quadratic(decoder, points, sdf, codes.detach())
-    assert torch.allclose(about.value, value, atol=1e-7)
+def test_an_unknown_pose_is_found(decoder):
+    shifted = ball(0.5, shift=np.array([0.12, -0.08, 0.1]))
+    fitted = NEWTON(decoder, CODES, [shifted], DELTA, POSES)
+    centre = torch.tensor([[[0.12, -0.08, 0.1]]])
+    assert fitted.poses.moved(centre).abs().max() < 0.02
+    assert fitted.residuals[0] < 0.02
+
+
+def test_deepsdfs_recipe_takes_samples_and_nothing_else(decoder):
+    whole = ball(0.5)
+    vague = replace(whole, high=whole.high + np.float32(0.1))
+    surface = replace(whole, low=0 * whole.low, high=0 * whole.high)
+    for observation in (vague, surface):
+        with pytest.raises(SdfhubError, match="signed samples"):
+            ADAM(decoder, CODES, [observation], DELTA)
+    with pytest.raises(SdfhubError, match="poses"):
+        ADAM(decoder, CODES, [whole], DELTA, POSES)
+
+
+def test_a_field_within_its_bounds_violates_nothing(decoder):
+    seen, codes = rows(ball(0.5)), torch.randn(1, 4)
+    field = decoder(seen.points, codes).detach()
+    inside = seen._replace(low=field - 0.01, high=field + 0.01)
+    assert violation(decoder, codes, inside, 0.1).abs().max() == 0
+    above = violation(decoder, codes, seen._replace(low=field + 0.02, high=field + 0.03), 1.0)
+    below = violation(decoder, codes, seen._replace(low=field - 0.03, high=field - 0.02), 1.0)
+    assert torch.allclose(above, torch.tensor(-0.02), atol=1e-6)
+    assert torch.allclose(below, torch.tensor(0.02), atol=1e-6)
+
+
+def test_unsigned_bounds_take_either_side(decoder):
+    seen, codes = rows(ball(0.5)), torch.randn(1, 4)
+    size = decoder(seen.points, codes).detach().abs()
+    either = seen._replace(low=size, high=size, unsigned=torch.ones_like(seen.unsigned))
+    assert violation(decoder, codes, either, 1.0).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("poses", [None, POSES])
+def test_the_quadratic_has_the_objectives_value_and_gradient(decoder, poses):
+    """By a plain forward pass and autograd, for each of two priors."""
+    priors = [Prior(Gaussian.of(CODES, 0.3), 1e-2), Prior(Gaussian.isotropic(CODES[0], 2.0), 1e-3)]
+    problem = Problem(decoder, priors, DELTA, poses)
+    seen = Rows.of([ball(0.5, noise=0.01)] * 2, 1e-3, [0, 1], torch.device("cpu"))
+    unknowns = 0.1 * torch.randn(2, problem.center.shape[1], generator=torch.Generator().manual_seed(1))
+    turn = torch.tensor([0, 0 if poses is None else 1])
+
+    def objective(at):
+        moved, scale = seen.turned(problem.turns[turn]), 1
+        if poses:
+            pose = small_similarity(at[:, 4:])
+            scale = pose.scale[:, None]
+            bounds = {name: getattr(moved, name) * scale for name in ("low", "high")}
+            moved = moved._replace(points=pose.moved(moved.points), **bounds)
+        size = violation(decoder, at[:, :4], moved, DELTA).abs() / scale
+        huber = torch.nn.functional.huber_loss(size, torch.zeros_like(size), delta=0.01, reduction="none")
+        pull = []
+        for away, prior in zip(at, priors, strict=True):
+            precision = torch.linalg.inv(prior.codes.covariance)
+            code = away[:4] - prior.codes.mean
+            spread = (away[4:] / poses.spread()).square().sum() if poses else 0
+            pull.append(prior.weight / 4 * (code @ precision @ code + spread))
+        return huber.mean(1) / 0.01 + torch.stack(pull)
+
+    at = unknowns.clone().requires_grad_()
+    value = objective(at)
+    (gradient,) = torch.autograd.grad(value.sum(), at)
+    about = problem.about(seen, turn, unknowns)
+    assert torch.allclose(about.value, value, atol=1e-6)
     assert torch.allclose(about.gradient, gradient, atol=1e-5)
+    assert torch.linalg.eigvalsh(about.hessian).min() > 0
+
+
+def test_the_observation_of_a_stored_shape_is_the_same_in_any_company():
+    shapes = [FakeShape(0.45), FakeShape(0.5)]
+    both = observations_of(shapes, 200, [3, 4])
+    (alone,) = observations_of(shapes[1:], 200, [4])
+    assert all(observation.is_exact for observation in both)
+    assert np.array_equal(both[1].points, alone.points) and (alone.low < 0).sum() == 100
+    (whole,) = observations_of(shapes[:1], None, [0])
+    assert len(whole.points) == len(shapes[0].outside) + len(shapes[0].inside)
 
 
 @pytest.mark.parametrize(
-    ("fit", "settings", "message"),
+    ("fit", "wrong"),
     [
-        (AdamFit, ADAM | {"steps": 0}, "at least 1"),
-        (AdamFit, ADAM | {"lr": 0.0}, "positive"),
-        (GaussNewtonFit, NEWTON | {"thinning": 0}, "at least 1"),
-        (GaussNewtonFit, NEWTON | {"damping": 0.0}, "positive"),
+        (NEWTON, {"probes": 0}),
+        (NEWTON, {"nearest": -1}),
+        (NEWTON, {"damping": 0.0}),
+        (NEWTON, {"shrinkage": 1e-7}),
+        (ADAM, {"steps": 0}),
+        (ADAM, {"lr": 0.0}),
     ],
 )
-def test_fit_settings_out_of_range_are_refused(fit, settings, message):
-    with pytest.raises(ValueError, match=message):
-        fit(**settings)
+def test_settings_out_of_range_are_refused(fit, wrong):
+    with pytest.raises(ValueError, match="must"):
+        replace(fit, **wrong)
+
+
+def test_a_space_fits_as_the_configs_say():
+    """Opened from a file that knows no conf/, a space has the same defaults."""
+    conf = Path(__file__).parents[1] / "conf"
+    nodes = [
+        yaml.safe_load((conf / name).read_text()) for name in ("fit/gauss_newton.yaml", "reconstruct.yaml")
+    ]
+    for node, plain in zip((nodes[0], nodes[1]["evidence"]), (GaussNewtonFit(), Evidence()), strict=True):
+        assert type(plain)(**{key: value for key, value in node.items() if key != "_target_"}) == plain
+    published = yaml.safe_load((conf / "fit" / "deepsdf.yaml").read_text())
+    assert DeepSdfFit(**{key: value for key, value in published.items() if key != "_target_"}) == DeepSdfFit()

@@ -8,8 +8,7 @@ import lightning as L
 import pytest
 import torch
 
-from sdfhub.data.loading.batches import Augmentation, Loading
-from sdfhub.data.loading.datamodule import SdfDataModule
+from sdfhub.data.loading.batches import Loading, StepBatches
 from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Siren
 from sdfhub.model.decoder import Decoder
@@ -17,10 +16,9 @@ from sdfhub.model.encodings import Encoding, Fourier, Hash
 from sdfhub.model.fast import fused_hash
 from sdfhub.model.fast.computing import Computing
 from sdfhub.model.fast.fused_hash import FusedHash, fused
-from sdfhub.tasks.run import build_autodecoder
 from tests import twin_tinycudann
-from tests.test_config import composed
 from tests.test_training import FakeShape
+from tests.tiny import build_autodecoder, composed
 
 GPU = torch.device("cuda")
 GRIDS = {
@@ -92,9 +90,10 @@ def test_training_takes_it_and_leaves_nothing_of_it(installed, monkeypatch):
         monkeypatch.setattr(Computing, "quickest", lambda self, plain, _: quickest(self, plain, device))
         config = composed("experiment=hash_siren", "computing.compile=false")
         torch.manual_seed(0)
-        model = build_autodecoder(config, rows=2, steps=6)
+        model = build_autodecoder(config, rows=2)
         shapes = [FakeShape(0.4), FakeShape(0.6)]
-        data = SdfDataModule(shapes, Loading(2, 64, 16, 6, 0, Augmentation(), seed=0))
+        batches = StepBatches(shapes, Loading(2, 64, 16, passes_per_epoch=6))
+        data = torch.utils.data.DataLoader(batches, batch_size=None)
         watching = Watching()
         trainer = L.Trainer(
             accelerator="cpu", max_epochs=1, logger=False, callbacks=[watching], enable_progress_bar=False,

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omegaconf import DictConfig
 
 import sdfhub
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import read_run
 from sdfhub.tasks.import_deepsdf import OWN_KEYS, import_deepsdf, main
-from sdfhub.tasks.run import read_run
-from tests.test_config import composed
+from tests.tiny import composed
 
 L, W = 5, 24
 SPECS = {
@@ -113,16 +114,17 @@ def write_experiment(folder: Path, old: bool = False, **network) -> tuple[dict, 
 
 
 @pytest.fixture(scope="module")
-def config() -> dict:
+def config() -> DictConfig:
     """The task's config; the folder is to be filled in."""
     return composed("folder=here", config_name="import_deepsdf")
 
 
-def imported(config: dict, folder: Path, root: Path = Path("data"), **settings) -> sdfhub.Space:
+def imported(config: DictConfig, folder: Path, root: Path = Path("data"), **settings) -> sdfhub.Space:
     config, experiment = copy.deepcopy(config), folder / "examples" / "balls"
-    config["data"]["source"]["root"] = str(root)
+    config.data.source.root = str(root)
     settings = {"folder": str(experiment), "out": str(folder / "run")} | settings
-    return sdfhub.load(import_deepsdf(config | settings), device="cpu")
+    config.update(settings)
+    return sdfhub.load(import_deepsdf(config), device="cpu")
 
 
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
@@ -178,7 +180,7 @@ REFUSED = {
 }
 
 
-def refusal(config: dict, folder: Path, **settings) -> str:
+def refusal(config: DictConfig, folder: Path, **settings) -> str:
     with pytest.raises(SdfhubError) as refused:
         imported(config, folder, **settings)
     assert not (folder / "run").exists()
@@ -239,7 +241,7 @@ def test_importing_runs_no_code_of_the_experiment(config, tmp_path):
 
 def test_the_command_takes_the_folder_as_its_first_word_and_writes_over_no_run(monkeypatch, tmp_path, capsys):
     write_experiment(tmp_path)
-    argv = ["sdfhub", str(tmp_path / "examples" / "balls"), f"output_root={tmp_path / 'outputs'}"]
+    argv = ["sdfhub", str(tmp_path / "examples" / "balls"), f"paths.output={tmp_path / 'outputs'}"]
     monkeypatch.setattr(sys, "argv", argv)
     main()
     assert "3 shapes, 0 of them with their source's frame" in capsys.readouterr().out

@@ -1,22 +1,20 @@
 """Folders of runs: one each, found again under SLURM, and told at once where nothing can be written."""
 
 from types import SimpleNamespace
-from unittest.mock import patch
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 
+from sdfhub.composition import configuration_folder, plain
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks import evaluate as evaluate_task
-from sdfhub.tasks.app import register_resolvers
-from sdfhub.tasks.conf_files import configuration_folder
-from sdfhub.tasks.evaluate import evaluate_run
-from sdfhub.tasks.made_with import made_with
+from sdfhub.evaluation.made_with import made_with
+from sdfhub.multirun.names import register_resolvers
+from sdfhub.opening import begin_run
 from sdfhub.tasks.resuming import refuse_other_shapes
-from sdfhub.tasks.run import begin_run
-from tests.test_config import composed
+from sdfhub.whole_file import refuse_unwritable
+from tests.tiny import composed
 
 
 def run_folder(*words: str) -> str:
@@ -42,12 +40,12 @@ def test_a_slurm_job_has_the_same_folder_whenever_it_starts_and_one_for_each_of_
 
 def test_what_was_judged_before_is_no_answer_to_a_training_that_begins(tmp_path):
     (tmp_path / "metrics.json").write_text("{}")
-    begin_run(tmp_path, composed(), ["a"], [], {}, "z")
+    begin_run(tmp_path, plain(composed()), ["a"], [], {}, "z")
     assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "split.json", "frames.json"}
 
 
 def test_a_checkpoint_is_not_continued_on_other_shapes(tmp_path):
-    begin_run(tmp_path, composed(), ["a", "b"], [], {}, "z")
+    begin_run(tmp_path, plain(composed()), ["a", "b"], [], {}, "z")
     checkpoint = tmp_path / "checkpoints" / "last.ckpt"
     refuse_other_shapes(checkpoint, ["a", "b"])
     for ids, row in ((["a", "c"], 1), (["b", "a"], 0), (["a"], 1), (["a", "b", "c"], 2)):
@@ -62,14 +60,7 @@ def test_a_device_that_is_no_nvidia_gpu_is_written_down_too():
     assert made_with(trainer)["device"]
 
 
-def test_results_that_could_not_be_written_are_told_before_the_evaluation(tmp_path):
+def test_results_that_could_not_be_written_are_refused_before_the_evaluation(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    config = composed(f"run={tmp_path}", f"out={tmp_path / 'file' / 'out'}", config_name="evaluate")
-    trained = composed()
-    with (
-        patch.object(evaluate_task, "read_run", lambda run: (trained, {"train": [], "held_out": []})),
-        patch.object(evaluate_task, "load", lambda run: None),
-        patch.object(evaluate_task, "prepare_split", lambda *_: pytest.fail("prepared")),
-        pytest.raises(SdfhubError, match="out: cannot be written"),
-    ):
-        evaluate_run(config)
+    with pytest.raises(SdfhubError, match="out: cannot be written"):
+        refuse_unwritable(tmp_path / "file" / "out")

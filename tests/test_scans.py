@@ -9,13 +9,12 @@ from sdfhub.errors import SdfhubError
 from sdfhub.scans.cloud import is_outside, noise_of, winding
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.free_space import free_space
+from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import Scan, read_scan
-from sdfhub.scans.scanning import surface_scan, view_scan
-from sdfhub.scans.target import observed
-from sdfhub.shapes import RADIUS
+from sdfhub.scans.simulated import surface_scan, view_scan
+from sdfhub.shapes import NORMALIZED, RADIUS, Frame
 
-EVIDENCE = {"rows": 3000, "surface": 0.25, "uniform": 0.15, "variances": (0.005, 0.0005), "cells": 40}
-EVIDENCE |= {"certain": 0.2, "background": False, "quiet": 0.003}
+EVIDENCE = Evidence(rows=3000, samples=3000, cells=40)
 SENSOR = np.array([0.0, -2.4, 0.6])
 
 
@@ -49,7 +48,7 @@ def excluded(box, observation) -> np.ndarray:
 def test_gaps_between_noisy_points_are_bare_of_evidence(box, with_normals, noise, count):
     points, normals = cloud(box, count, noise)
     rng = np.random.default_rng(1)
-    seen = Evidence(**EVIDENCE).of_cloud(points, normals if with_normals else None, rng)
+    seen = EVIDENCE.of_cloud(points, normals if with_normals else None, rng)
     bounded = seen.low != seen.high  # the rest lies on the surface, but for the noise
     assert np.mean(excluded(box, seen)[bounded] > 0.01) < 0.02
 
@@ -59,9 +58,9 @@ def test_gaps_between_noisy_points_are_bare_of_evidence(box, with_normals, noise
 def test_bounds_around_a_cloud_hold_the_truth(box, with_normals, noise):
     points, normals = cloud(box, noise=noise)
     rng = np.random.default_rng(1)
-    seen = Evidence(**EVIDENCE).of_cloud(points, normals if with_normals else None, rng)
+    seen = EVIDENCE.of_cloud(points, normals if with_normals else None, rng)
     wrong = excluded(box, seen)
-    assert len(seen.points) == EVIDENCE["rows"]
+    assert len(seen.points) == EVIDENCE.rows
     assert np.mean(wrong > 0.004 + 2 * noise) < 0.03
     assert np.mean(seen.high - seen.low) < 0.03 + 4 * noise, "they say something"
     known = ~seen.unsigned & (seen.low > 0.03)
@@ -75,7 +74,7 @@ def test_bounds_of_a_view_hold_the_truth_behind_it(box):
     points = view_scan(box, SENSOR, 60, 0.0, rng)
     assert np.abs(true_sdf(box, points)).max() < 1e-5
     assert points[:, 1].max() < box.vertices[:, 1].max() - 0.05, "the far side is not seen"
-    seen = Evidence(**EVIDENCE).of_view(points, None, SENSOR, rng)
+    seen = EVIDENCE.of_view(points, None, SENSOR, rng)
     assert np.mean(excluded(box, seen) > 0.005) < 0.02
     assert (seen.low > 0.05).mean() > 0.02, "free space keeps surfaces away"
 
@@ -155,19 +154,18 @@ def test_the_shapes_own_box_undoes_any_units(box):
     far = points * 700 + [1e4, 0, -3e3]
     rng = [np.random.default_rng(0) for _ in range(2)]
     here, there = (
-        observed(Scan(at, normals), Evidence(**EVIDENCE), "shape", each)
-        for at, each in ((points, rng[0]), (far, rng[1]))
+        observe(Scan(at, normals), EVIDENCE, "shape", each) for at, each in ((points, rng[0]), (far, rng[1]))
     )
     assert np.allclose(here.observation.points, there.observation.points, atol=1e-4)
-    corner = np.linalg.norm((far - there.center) * there.scale, axis=1).max()
+    corner = np.linalg.norm(there.frame.to_normalized(far), axis=1).max()
     assert corner == pytest.approx(RADIUS)
 
 
 def test_a_mesh_becomes_its_own_samples(box):
     source = box.vertices * 3 + 1
-    target = observed(Scan(source, faces=box.faces), Evidence(**EVIDENCE), "shape", np.random.default_rng(0))
+    target = observe(Scan(source, faces=box.faces), EVIDENCE, "shape", np.random.default_rng(0))
     assert target.kind == "samples" and excluded(box, target.observation).max() < 1e-3
-    assert np.allclose(box.vertices / target.scale + target.center, source, atol=1e-6)
+    assert np.allclose(target.frame.to_source(box.vertices), source, atol=1e-6)
 
 
 WRONG = {
@@ -217,8 +215,8 @@ def test_a_broken_file_is_one_line_that_names_it(box, tmp_path, name):
 @pytest.mark.parametrize(
     ("points", "sensor", "frame", "words"),
     [
-        (500.0, None, "normalised", "frame=shape"),
-        (0.01, None, "normalised", "frame=shape"),
+        (500.0, None, NORMALIZED, "frame=shape"),
+        (0.01, None, NORMALIZED, "frame=shape"),
         ([1.0, 1.0, 0.0], None, "shape", "extents"),
         (1.0, SENSOR, "shape", "frame=unknown"),
     ],
@@ -226,13 +224,13 @@ def test_a_broken_file_is_one_line_that_names_it(box, tmp_path, name):
 def test_a_scan_that_does_not_fit_its_frame_says_what_would(box, points, sensor, frame, words):
     scan = Scan(cloud(box, 200)[0] * points, sensor=sensor)
     with pytest.raises(SdfhubError, match=words):
-        observed(scan, Evidence(**EVIDENCE), frame, np.random.default_rng(0))
+        observe(scan, EVIDENCE, frame, np.random.default_rng(0))
 
 
 def test_a_mesh_that_does_not_fit_its_frame_hears_of_meshes(box):
     scan = Scan(box.vertices * 500, faces=box.faces)
     with pytest.raises(SdfhubError, match="reaches .* give frame=shape if it is whole"):
-        observed(scan, Evidence(**EVIDENCE), "normalised", np.random.default_rng(0))
+        observe(scan, EVIDENCE, NORMALIZED, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("count", [4096, 65_536])
@@ -243,7 +241,7 @@ def test_the_outside_does_not_leak_into_a_dense_cloud_nor_into_one_whose_points_
     points *= 0.8 / np.linalg.norm(points, axis=1, keepdims=True)
     twice = np.repeat(points[: count // 2], 2, axis=0)
     for cloud in (points, twice):
-        target = observed(Scan(cloud), Evidence(**EVIDENCE), "normalised", np.random.default_rng(1))
+        target = observe(Scan(cloud), EVIDENCE, NORMALIZED, np.random.default_rng(1))
         seen = target.observation
         inside = np.linalg.norm(seen.points, axis=1) < 0.7
         assert inside.sum() > 50 and seen.unsigned[inside].all(), "none is surely outside"
@@ -255,14 +253,14 @@ def test_inside_and_outside_of_a_cloud_whose_gaps_reach_the_corners():
 
 
 def test_shares_that_leave_no_row_leave_none():
-    half = Evidence(4095, 0.5, 0.5, (0.01,), 24, 0.1, False, 0.003)
+    half = Evidence(4095, surface=0.5, uniform=0.5, variances=(0.01,))
     assert half.rows - round(half.surface * half.rows) - half._uniform() == 0
 
 
 def test_a_cloud_of_few_different_points_is_refused():
     points = np.repeat(np.random.default_rng(0).uniform(-1, 1, (30, 3)), 3, axis=0)
     with pytest.raises(SdfhubError, match="30 different points"):
-        observed(Scan(points), Evidence(**EVIDENCE), "shape", np.random.default_rng(0))
+        observe(Scan(points), EVIDENCE, "shape", np.random.default_rng(0))
 
 
 def test_normals_of_any_length_are_directions():
@@ -272,12 +270,33 @@ def test_normals_of_any_length_are_directions():
 
 
 @pytest.mark.parametrize(
-    "part", [{"center": np.zeros((1, 3))}, {"center": np.full(3, np.nan)}, {"scale": 0.0}]
+    "part", [{"center": np.zeros((1, 3))}, {"center": np.full(3, np.nan)}, {"scale": np.zeros(1)}]
 )
-def test_a_frame_that_is_none_is_refused(part):
+def test_a_frame_that_is_none_is_refused(part, tmp_path):
     points = np.random.default_rng(0).uniform(-1, 1, (60, 3))
-    with pytest.raises(ValueError, match=next(iter(part))):
-        Scan(points, sdf=points[:, 0], **part)
+    np.savez(tmp_path / "a.npz", points=points, sdf=points[:, 0], **part)
+    with pytest.raises(SdfhubError, match=r"a.npz: .*" + next(iter(part))):
+        read_scan(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("kind", ["cloud", "mesh", "samples", "view"])
+def test_a_scan_in_the_frame_of_a_known_source_is_what_it_is_in_the_normalised_frame(box, kind):
+    frame = Frame(np.array([3.0, -1.0, 2.0]), 0.25)
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-1, 1, (4000, 3))
+    made = {
+        "cloud": lambda move, size: Scan(move(cloud(box)[0])),
+        "mesh": lambda move, size: Scan(move(box.vertices), faces=box.faces),
+        "samples": lambda move, size: Scan(move(at), sdf=size * true_sdf(box, at)),
+        "view": lambda move, size: Scan(
+            move(view_scan(box, SENSOR, 60, 0.0, np.random.default_rng(0))), sensor=move(SENSOR)
+        ),
+    }[kind]
+    here = observe(made(lambda points: points, 1.0), EVIDENCE, NORMALIZED, np.random.default_rng(1))
+    there = observe(made(frame.to_source, 4.0), EVIDENCE, frame, np.random.default_rng(1))
+    assert np.abs(here.observation.points - there.observation.points).max() < 1e-5
+    assert np.abs(here.observation.high - there.observation.high).max() < 1e-3
+    np.testing.assert_allclose(there.frame.to_source(box.vertices), frame.to_source(box.vertices))
 
 
 def test_a_cut_cloud_in_text_is_refused(tmp_path, box):

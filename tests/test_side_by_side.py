@@ -7,21 +7,18 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
-from sdfhub.latent.fitting import GaussNewtonFit
-from sdfhub.model.activations import Hosc, Relu, Siren
+from sdfhub.model.activations import Hosc, Siren
+from sdfhub.model.decoder import activated
+from sdfhub.model.dropout import drawn_from, dropout_factors
 from sdfhub.model.fast.computing import Computing, distances
-from sdfhub.model.fast.dropout import drawn_from, kept
-from sdfhub.model.fast.loops import ALONE
 from sdfhub.model.fast.side_by_side import _pool, side_by_side
-from sdfhub.tasks.run import build_autodecoder
-from tests.test_config import composed
-from tests.test_fitting import NEWTON, draws
+from sdfhub.model.fast.waves import ALONE
 from tests.test_model import small_decoder
 from tests.test_training import batches
+from tests.tiny import build_autodecoder, composed
 
 FORKED = """
 import os, torch
@@ -111,25 +108,6 @@ def test_several_callers_share_the_threads(several):
     assert found == [list(range(-first, 0, -1)) for first in range(-9, -1)]
 
 
-def test_where_the_system_has_no_more_threads_nothing_is_left_waiting(several, monkeypatch):
-    _pool.cache_clear()
-    start, started = threading.Thread.start, []
-
-    def once(self):
-        started.append(self)
-        if len(started) > 1:
-            raise RuntimeError("can't start new thread")
-        start(self)
-
-    monkeypatch.setattr(threading.Thread, "start", once)
-    with pytest.raises(RuntimeError, match="can't start"):
-        side_by_side(abs, range(4))
-    monkeypatch.undo()
-    started[0].join(timeout=30)
-    assert not started[0].is_alive() and torch.get_num_threads() == several
-    assert side_by_side(abs, [-1, -2]) == [1, 2]
-
-
 def test_an_interruption_leaves_no_thread_at_work(several):
     """As Ctrl-C comes: in the calling thread, while it waits."""
     ended = []
@@ -153,7 +131,7 @@ def test_a_forked_process_has_threads_of_its_own():
     assert subprocess.run([sys.executable, "-c", FORKED], timeout=120).returncode == 0
 
 
-@pytest.mark.parametrize("activation", [Relu(), Siren(15.0, 3.0), Hosc(15.0, 3.0, 2.0)], ids=repr)
+@pytest.mark.parametrize("activation", [Siren(15.0, 3.0), Hosc(15.0, 3.0, 2.0)], ids=repr)
 def test_a_loop_on_several_threads_is_the_loop_on_one(activation, several):
     torch.manual_seed(0)
     product = torch.randn(3, 2 * ALONE // 60, 21, requires_grad=True)
@@ -162,7 +140,7 @@ def test_a_loop_on_several_threads_is_the_loop_on_one(activation, several):
     by = torch.randn(product.shape)
 
     def found():
-        value = activation.shifted(product, shift)
+        value = activated(activation, product, shift)[0]
         return value, *torch.autograd.grad(value, [product, shift], by)
 
     for have, want in zip(found(), alone(found), strict=True):
@@ -174,7 +152,7 @@ def test_a_step_on_several_threads_is_the_step_on_one(experiment, several):
     """With DeepSDF's dropout and its longest codes, too."""
     config = composed(f"experiment={experiment}", "decoder.width=300", "computing.points_at_once=70")
     torch.manual_seed(0)
-    model, batch = build_autodecoder(config, rows=5, steps=10), batches(per_step=5)[0]
+    model, batch = build_autodecoder(config, rows=5), batches(per_step=5)[0]
     codes, learned = 3 * model.codes.table.detach(), list(model.parameters())  # some are too long
 
     def found():
@@ -194,11 +172,11 @@ def test_dropout_drawn_from_a_seed_is_a_function_of_it():
 
     def factors(seed):
         with drawn_from(seed):
-            return kept(hidden, 0.5)
+            return dropout_factors(hidden, 0.5)
 
     assert torch.equal(factors(3), factors(3)) and not torch.equal(factors(3), factors(4))
     torch.manual_seed(0)
-    outside = kept(hidden, 0.5)
+    outside = dropout_factors(hidden, 0.5)
     torch.manual_seed(0)
     assert torch.equal(factors(None), outside)
 
@@ -220,13 +198,3 @@ def test_distances_in_parts_are_those_of_the_decoder(shapes, count, several):
     points, codes = torch.rand(shapes, count, 3) - 0.5, torch.randn(shapes, 4)
     with torch.no_grad():
         torch.testing.assert_close(distances(decoder, points, codes), decoder(points, codes))
-
-
-def test_shapes_fitted_side_by_side_have_the_codes_that_each_has_alone(several):
-    torch.manual_seed(0)
-    decoder, fit = small_decoder(width=32), GaussNewtonFit(**NEWTON)
-    radii = np.linspace(0.4, 0.55, 5)
-    together = fit(decoder, draws(*radii), range(5))
-    each = [fit(decoder, draws(radius), [seed]) for seed, radius in enumerate(radii)]
-    assert torch.equal(together, torch.cat(each))
-    assert torch.equal(together, alone(lambda: fit(decoder, draws(*radii), range(5))))

@@ -77,7 +77,7 @@ def test_shapenet_of_both_versions_with_deepsdf_splits(tmp_path, layout):
         "chairs/c_1_",
     ]
     source = ShapeNetSource(categories, str(tmp_path / "tree"), **splits)
-    assert [(s.id, s.split) for s in source.shapes()] == [("chairs/aa", "train"), ("chairs/c_1_", "test")]
+    assert [(s.id, s.split) for s in source.shapes()] == [("chairs/aa", "train"), ("chairs/c_1_", "held_out")]
     for shape in source.shapes():
         assert len(pickle.loads(pickle.dumps(source)).load(shape)[1]) == len(BALL.faces)
 
@@ -121,9 +121,15 @@ def test_folder_fingerprints_follow_content_not_dates(tmp_path):
 def test_folder_honours_one_split_file_for_both_sides(tmp_path):
     for name in ("a", "sub/b", "sub/c"):
         put(tmp_path / "m" / f"{name}.obj")
-    split = str(put(tmp_path / "split.json", json.dumps({"train": ["a", "sub/b"], "test": ["c"]}).encode()))
+    split = str(
+        put(tmp_path / "split.json", json.dumps({"train": ["a", "sub/b"], "held_out": ["c"]}).encode())
+    )
     shapes = FolderSource(str(tmp_path / "m"), split, split).shapes()
-    assert [(s.id, s.split) for s in shapes] == [("folder/a", "train"), ("sub/b", "train"), ("sub/c", "test")]
+    assert [(s.id, s.split) for s in shapes] == [
+        ("folder/a", "train"),
+        ("sub/b", "train"),
+        ("sub/c", "held_out"),
+    ]
 
 
 def test_a_name_that_is_a_path_means_that_file_alone(tmp_path):
@@ -132,7 +138,7 @@ def test_a_name_that_is_a_path_means_that_file_alone(tmp_path):
     split = str(put(tmp_path / "split.json", json.dumps({"train": ["sub/a"], "test": ["a", "b"]}).encode()))
     shapes = FolderSource(str(tmp_path / "m"), split, split).shapes()
     roles = {shape.id: shape.split for shape in shapes}
-    assert roles == {"folder/a": "test", "sub/a": "train", "sub/b": "test"}
+    assert roles == {"folder/a": "held_out", "sub/a": "train", "sub/b": "held_out"}
 
 
 @pytest.mark.parametrize(
@@ -289,7 +295,7 @@ def test_meshes_of_a_folder_go_into_the_store(tmp_path):
     source = FolderSource(str(tmp_path / "m"))
     settings = Preparation(samples=2000, surface_points=100)
     stored = prepare(source, source.shapes(), settings, tmp_path / "store", workers=1, progress=False)
-    assert stored.ids == ["folder/ball"] and stored.rejected["folder/broken"]["reason"] == "no_faces"
+    assert stored.ids == ["folder/ball"] and stored.rejected["folder/broken"].reason == "no_faces"
     rows = np.concatenate([stored["folder/ball"].outside, stored["folder/ball"].inside])
     assert len(rows) == 2000
     radius = np.linalg.norm(rows[:, :3], axis=1)
@@ -310,20 +316,44 @@ def test_a_file_named_in_another_encoding_is_prepared_once(tmp_path):
     few = Preparation(samples=500, surface_points=100)
     source = FolderSource(str(tmp_path / "m"))
     prepare(source, source.shapes(), few, tmp_path / "store", workers=1)
-    (record,) = (tmp_path / "store").glob("**/shape.json")
+    (record,) = (tmp_path / "store").glob("**/*.safetensors")
     made = record.stat().st_mtime_ns
     assert len(prepare(source, source.shapes(), few, tmp_path / "store", workers=1)) == 1
-    assert record.stat().st_mtime_ns == made, "the manifest that names it can be read again"
+    assert record.stat().st_mtime_ns == made, "its record can be read again"
 
 
-def test_names_of_a_split_that_are_not_there_are_told(tmp_path, capsys):
+def test_names_of_a_split_that_are_not_there_are_told(tmp_path, caplog):
     put(tmp_path / "m" / "a.obj")
     split = str(put(tmp_path / "split.json", b'["a", "b.obj", "typo"]'))
     assert ids(FolderSource(str(tmp_path / "m"), split)) == ["folder/a"]
-    assert "2 of the 3 train shapes it lists are not there, such as b.obj" in capsys.readouterr().out
+    assert "2 of the 3 train shapes it lists are not there, such as b.obj" in caplog.text
 
 
 def test_samples_of_another_frame_are_refused(tmp_path):
     rows = np.random.default_rng(0).uniform(1, 100, (100, 4)).astype(np.float32)
     with pytest.raises(RejectedMesh, match=r"wrong_frame: .*a\.npz: has points 9\d"):
         read_samples(samples_file(tmp_path / "a.npz", pos=rows))
+
+
+def test_categories_of_a_folder_are_its_first_subfolders(tmp_path):
+    for name in ("chairs/a", "chairs/b", "my lamps/c", "d"):
+        put(tmp_path / f"{name}.obj")
+    assert ids(FolderSource(str(tmp_path), categories={})) == [
+        "chairs/a",
+        "chairs/b",
+        "folder/d",
+        "my_lamps/c",
+    ]
+    assert ids(FolderSource(str(tmp_path), categories={"chairs": {}})) == ["chairs/a", "chairs/b"]
+    assert ids(FolderSource(str(tmp_path), categories=["my_lamps"])) == ["my_lamps/c"]
+    with pytest.raises(SdfhubError, match=r"category=sofas: .* but chairs, folder, my_lamps;"):
+        FolderSource(str(tmp_path), categories=["sofas"]).shapes()
+
+
+def test_a_root_means_the_same_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sources = [FolderSource("my meshes", "split.json"), DeepSdfSource("my meshes", train_split="split.json")]
+    sources.append(ShapeNetSource({"chairs": CATEGORIES["chairs"]}, "my meshes", "split.json"))
+    for source in sources:
+        assert source.root == tmp_path / "my meshes" and source.train_split == str(tmp_path / "split.json")
+    assert sources[0].label == "my_meshes"

@@ -22,7 +22,7 @@ def overrides(tmp_path: Path, folder: Path, epochs: int = 30) -> list[str]:
         "data.shapes=4",
         "data.held_out=0",
         "data.loader.passes_per_epoch=10",
-        "callbacks=none",
+        "callbacks=quiet",
         "evaluate.known=1",
         "trainer=cpu",
         f"trainer.max_epochs={epochs}",
@@ -68,7 +68,9 @@ def assert_same(folder: Path, expected: dict[str, torch.Tensor]) -> None:
         assert torch.equal(value, expected[name]), name
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)]
+)
 def test_a_training_told_to_stop_leaves_a_checkpoint_its_status_and_goes_on(number, status, undisturbed):
     root, expected = undisturbed
     folder = root / f"a run, stöpped by {number.name}"  # spaces and letters of all kinds

@@ -3,17 +3,16 @@
 import dataclasses
 import os
 import pickle
-import shutil
 import time
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
-from sdfhub.data.preparation.sampling import Preparation
+from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
-from sdfhub.data.store import shards, store
-from sdfhub.data.store.manifest import read_manifest, write_manifest
-from sdfhub.data.store.store import Store, prepare
+from sdfhub.data.store import store
+from sdfhub.data.store.store import Store, prepare, prepare_part
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 
@@ -62,9 +61,18 @@ def fill(root, source, **settings) -> Store:
     return prepare(source, source.shapes(), root=root, **settings)
 
 
-def content(prepared: Store) -> dict[str, bytes]:
-    files = sorted(prepared.folder.rglob("*.npy"))
-    return {str(file.relative_to(prepared.folder)): file.read_bytes() for file in files}
+def content(prepared: Store) -> dict[str, dict[str, bytes]]:
+    """The arrays of each shape, as another reader of safetensors sees them."""
+    arrays = {shape.id: safetensors.numpy.load_file(shape.path) for shape in prepared}
+    return {id: {name: array.tobytes() for name, array in found.items()} for id, found in arrays.items()}
+
+
+@pytest.fixture
+def loaded(monkeypatch) -> list[str]:
+    """Ids of the shapes that the source is asked to load from now on."""
+    ids, load = [], Balls.load
+    monkeypatch.setattr(Balls, "load", lambda self, shape: ids.append(shape.id) or load(self, shape))
+    return ids
 
 
 def test_rows_are_kept_and_parted_by_sign(tmp_path):
@@ -78,7 +86,8 @@ def test_rows_are_kept_and_parted_by_sign(tmp_path):
     assert not np.array_equal(shape.outside, rows[rows[:, 3] >= 0])  # shuffled
     pairs = {tuple(row) for row in np.column_stack([samples.surface_points, samples.surface_normals])}
     assert {tuple(row) for row in shape.surface} == pairs  # point and normal stay together
-    assert shape.rows("surface") == 50 and shape.statistics == {"inside": 0.4}
+    assert shape.rows("surface") == 50 and shape.record.statistics == {"inside": 0.4}
+    assert shape.credits == {"author": "A", "licence": "B"}
 
 
 def test_mesh_and_frame_survive(tmp_path):
@@ -94,23 +103,20 @@ def test_neither_order_nor_workers_change_a_byte(tmp_path):
     here = fill(tmp_path / "a", source)
     source.listed = source.listed[::-1]
     there = fill(tmp_path / "b", source, workers=2)
-    assert content(here) == content(there) and len(content(here)) == 15
+    assert content(here) == content(there) and len(content(here)) == 3
 
 
-def test_second_run_loads_nothing(tmp_path, monkeypatch):
-    source = Balls(3)
-    fill(tmp_path, source)
-    monkeypatch.setattr(Balls, "load", lambda *_: pytest.fail("loaded again"))
-    assert fill(tmp_path, source).ids == ["balls/0000", "balls/0001", "balls/0002"]
+def test_second_run_loads_nothing(tmp_path, loaded):
+    fill(tmp_path, Balls(3))
+    loaded.clear()
+    assert fill(tmp_path, Balls(3)).ids == ["balls/0000", "balls/0001", "balls/0002"] and not loaded
 
 
-def test_a_changed_fingerprint_prepares_that_shape_again(tmp_path, monkeypatch):
+def test_a_changed_fingerprint_prepares_that_shape_again(tmp_path, loaded):
     source = Balls(3)
     before = fill(tmp_path, source)
+    loaded.clear()
     source.listed[1] = dataclasses.replace(source.listed[1], fingerprint="v2")
-    loaded = []
-    load = Balls.load
-    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or load(self, shape))
     after = fill(tmp_path, source)
     assert loaded == ["balls/0001"] and after.folder == before.folder
     assert after["balls/0001"].fingerprint == "v2"
@@ -134,8 +140,8 @@ def test_one_bad_mesh_costs_only_itself(tmp_path):
     source = Balls(2, bad={"balls/few": "reject", "balls/odd": "raise"})
     prepared = fill(tmp_path, source)
     assert prepared.ids == ["balls/0000", "balls/0001"]
-    assert prepared.rejected["balls/few"]["reason"] == "few_faces"
-    assert prepared.rejected["balls/odd"]["reason"] == "error"
+    assert prepared.rejected["balls/few"].reason == "few_faces"
+    assert prepared.rejected["balls/odd"].reason == "error"
     assert "surprise" in prepared.summary() and "2 shapes kept, 2 rejected" in prepared.summary()
     with pytest.raises(SdfhubError, match="few_faces"):
         prepared["balls/few"]
@@ -143,14 +149,14 @@ def test_one_bad_mesh_costs_only_itself(tmp_path):
 
 def test_a_dying_worker_costs_only_its_shape(tmp_path):
     prepared = fill(tmp_path, Balls(3, bad={"balls/0000x": "die"}), workers=2)
-    assert len(prepared) == 3 and prepared.rejected["balls/0000x"]["reason"] == "crash"
+    assert len(prepared) == 3 and prepared.rejected["balls/0000x"].reason == "crash"
 
 
-def test_rejections_are_remembered_and_accidents_tried_again(tmp_path, monkeypatch):
+def test_rejections_are_remembered_and_accidents_tried_again(tmp_path, loaded):
     source = Balls(1, bad={"balls/few": "reject", "balls/odd": "raise"})
     fill(tmp_path, source)
-    loaded = []
-    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or ball(1))
+    loaded.clear()
+    source.bad = {}
     assert len(fill(tmp_path, source)) == 2 and loaded == ["balls/odd"]
 
 
@@ -159,69 +165,33 @@ def test_a_store_with_nothing_usable_is_an_error(tmp_path):
         fill(tmp_path, Balls(0, bad={"balls/few": "reject"}))
 
 
-def test_a_killed_run_keeps_whole_shapes_only(tmp_path, monkeypatch):
-    source = Balls(3)
-    folder = fill(tmp_path, source).folder
-    (folder / store.MANIFEST).unlink()  # killed before it was written
-    (folder / "balls/0001/shape.json").unlink()  # cannot happen by a rename, but by a disk
-    cut = folder / "balls/0002/inside.npy"
-    cut.write_bytes(cut.read_bytes()[:-8])
-    loaded = []
-    load = Balls.load
-    monkeypatch.setattr(Balls, "load", lambda self, shape: loaded.append(shape.id) or load(self, shape))
-    prepared = fill(tmp_path, source)
-    assert loaded == ["balls/0001", "balls/0002"] and len(prepared) == 3
-    assert not any(shape.damaged() for shape in prepared)
-    assert not [path for path in folder.rglob(".*") if path.name != ".lock"]  # nothing half left over
+def test_parts_are_prepared_apart_and_taken_over(tmp_path, loaded):
+    source = Balls(5)
+    made = [prepare_part(source, source.listed[i::2], SETTINGS, tmp_path, 1, False) for i in (0, 1, 1)]
+    assert made == [3, 2, 0]
+    loaded.clear()
+    assert len(fill(tmp_path, source)) == 5 and not loaded
 
 
 def test_leftovers_of_killed_runs_go_away(tmp_path):
     folder = fill(tmp_path, Balls(1)).folder
-    new, old = ".0001.0123456789ab", ".0002.0123456789ab.old"
+    new, old = ".0001.safetensors.0123456789ab", ".0002.safetensors.0123456789ab"
     for name, age in ((old, 9999), (new, 0)):
-        (folder / "balls" / name).mkdir()
+        (folder / "balls" / name).touch()
         os.utime(folder / "balls" / name, (time.time() - age,) * 2)
     fill(tmp_path, Balls(2))
     assert [path.name for path in (folder / "balls").glob(".*")] == [new]
 
 
-def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(shards.os, "fsync", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(SdfhubError, match="disk full"):
-        fill(tmp_path, Balls(1))
-    assert not list(tmp_path.rglob("*.npy")) and not list(tmp_path.rglob("*.json"))
-
-
-@pytest.mark.parametrize("damage", ["cut", "shape", "dtype", "gone", "pickle"])
-def test_a_damaged_file_is_named(tmp_path, damage):
-    prepared = fill(tmp_path, Balls(1))
-    path = prepared.folder / "balls/0000/outside.npy"
-    rows = np.load(path)
-    match damage:
-        case "cut":
-            path.write_bytes(path.read_bytes()[:-100])
-        case "gone":
-            path.unlink()
-        case "pickle":
-            np.save(path, np.array([{}], dtype=object), allow_pickle=True)
-        case _:
-            np.save(path, rows[1:] if damage == "shape" else rows.astype(np.float64))
-    with pytest.raises(SdfhubError, match=r"outside\.npy.*prepare again"):
-        _ = Store.open(prepared.folder, ["balls/0000"])["balls/0000"].outside
-    assert prepared["balls/0000"].damaged() == ["outside"]
-
-
-def test_opening_asks_for_known_shapes_and_a_manifest(tmp_path):
+def test_opening_asks_for_known_shapes(tmp_path):
     prepared = fill(tmp_path, Balls(2))
     assert Store.open(prepared.folder).ids == prepared.ids
     assert Store.open(prepared.folder, ["balls/0001"]).ids == ["balls/0001"]
-    with pytest.raises(SdfhubError, match="balls/0007 has not been prepared"):
-        Store.open(prepared.folder, ["balls/0007"])
-    with pytest.raises(SdfhubError, match="prepare"):
+    for id in ("balls/0007", "../balls/0001"):
+        with pytest.raises(SdfhubError, match=f"{id} has not been prepared"):
+            Store.open(prepared.folder, [id])
+    with pytest.raises(SdfhubError, match="holds no prepared shapes"):
         Store.open(tmp_path / "nowhere", [])
-    (prepared.folder / store.MANIFEST).write_text("{]")
-    with pytest.raises(SdfhubError, match="manifest"):
-        Store.open(prepared.folder, [])
 
 
 def test_shapes_pickle_without_their_arrays(tmp_path):
@@ -239,45 +209,13 @@ def test_empty_arrays_have_their_columns(tmp_path, monkeypatch):
     assert shape.surface.shape == (0, 6) and shape.mesh is None
 
 
-def test_a_thousand_shapes_open_fast(tmp_path):
-    prepared = fill(tmp_path, Balls(1))
-    manifest = read_manifest(prepared.folder)
-    record = manifest["shapes"]["balls/0000"]
-    source = Balls(1000)
-    for shape in source.listed[1:]:
-        shutil.copytree(prepared.folder / "balls/0000", prepared.folder / shape.id, copy_function=os.link)
-    manifest["shapes"] = {shape.id: record | {"fingerprint": shape.fingerprint} for shape in source.listed}
-    write_manifest(prepared.folder, manifest)
-    start = time.perf_counter()
-    many = fill(tmp_path, source)
-    assert len(many) == 1000 and time.perf_counter() - start < 2
-
-
 def test_rows_read_from_disk_are_those_of_the_map_and_leave_nothing_open(tmp_path):
     for shape in fill(tmp_path, Balls(2)):
         for name in ("outside", "inside", "surface"):
             array = np.array(getattr(shape, name))
-            for start, count in (
-                (0, 5),
-                (len(array) - 3, 7),
-                (2, 2 * len(array) + 1),
-                (1, 0),
-                (len(array), 2),
-            ):
+            n = len(array)
+            for start, count in ((0, 5), (n - 3, 7), (2, 2 * n + 1), (1, 0), (n, 2)):
                 wanted = np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
                 assert np.array_equal(shape.read(name, start, count), wanted)
-    assert not [f for f in os.listdir("/proc/self/fd") if _is_shard(f)]
-
-
-def _is_shard(descriptor: str) -> bool:
-    try:
-        return os.readlink(f"/proc/self/fd/{descriptor}").endswith(".npy")
-    except OSError:
-        return False
-
-
-def test_manifest_lists_authors_and_settings(tmp_path):
-    prepared = fill(tmp_path, Balls(3))
-    manifest = read_manifest(prepared.folder)
-    assert manifest["credits"] == [{"author": "A", "licence": "B", "shapes": 3}]
-    assert manifest["preparation"] and manifest["version"] == store.VERSION
+    links = (f"/proc/self/fd/{descriptor}" for descriptor in os.listdir("/proc/self/fd"))
+    assert not [link for link in links if os.path.realpath(link).endswith(store.SUFFIX)]

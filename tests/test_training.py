@@ -10,7 +10,7 @@ from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches, draw
 from sdfhub.data.loading.datamodule import EpochSteps
 from sdfhub.errors import SdfhubError
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
-from sdfhub.model.optim import Adam, Cosine, StepDecay
+from sdfhub.model.optimisers import Cosine, Optimisation, StepDecay
 from sdfhub.shapes import Batch
 
 LOSS = SdfLoss(delta=0.1, lambda_code=1e-4, code_norm="squared", warmup=0.2, tau=0.01)
@@ -95,7 +95,7 @@ def test_cosine_schedule_falls_from_one_to_its_end():
 
 @pytest.mark.parametrize(("steps", "reached"), [(1000, 100), (60, 30)])
 def test_warm_up_is_counted_in_steps_but_takes_no_more_than_half_of_training(steps, reached):
-    optim = Adam(1e-3, 1e-2, Cosine(final=1.0), warmup_steps=100)
+    optim = Optimisation(1e-3, 1e-2, Cosine(final=1.0), warmup_steps=100)
     assert optim.factor(0, steps) == pytest.approx(1 / reached)
     assert optim.factor(reached - 2, steps) < 1
     assert optim.factor(reached - 1, steps) == optim.factor(steps, steps) == 1
@@ -103,7 +103,7 @@ def test_warm_up_is_counted_in_steps_but_takes_no_more_than_half_of_training(ste
 
 def test_each_group_has_its_own_learning_rate():
     decoder, codes = torch.nn.Parameter(torch.ones(2)), torch.nn.Parameter(torch.ones(2))
-    optimizer, _ = Adam(1e-3, 1e-2, Cosine()).configure([decoder], [codes], steps=10)
+    optimizer, _ = Optimisation(1e-3, 1e-2, Cosine()).configure([decoder], [codes], steps=10)
     assert {group["name"]: group["lr"] for group in optimizer.param_groups} == {
         "decoder": 1e-3,
         "codes": 1e-2,
@@ -158,8 +158,8 @@ def test_an_epoch_goes_on_where_the_last_ended():
     done = 8
     steps = EpochSteps(4, done=lambda: done)
     assert list(steps) == [8, 9, 10, 11]
-    done = 10  # a run stopped in the middle of an epoch does the rest of it
-    assert list(steps) == [10, 11] and len(steps) == 4
+    done = 10  # stopped in the middle of an epoch: the trainer ends it
+    assert list(steps) == [10, 11, 12, 13] and len(steps) == 4
 
 
 def test_augmented_copies_are_exact_signed_distances_of_similar_shapes():

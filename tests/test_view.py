@@ -18,6 +18,7 @@ from sdfhub.viewer.dropped_scan import fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.page import MEAN, Viewer, told
 from tests.ball_space import IDS, RADII, write_ball_run
+from tests.tiny import composed
 
 
 class Ball(torch.nn.Module):
@@ -227,7 +228,7 @@ def cloud_file() -> bytes:
 def test_a_mesh_or_cloud_is_fitted_as_the_space_fits_it_in_its_own_frame(space, name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     code, surface = fit_scan(space, name, content)
-    torch.testing.assert_close(code, space.fit_scan(read_scan(tmp_path / name), "shape"))
+    torch.testing.assert_close(code, space.fit_scan(read_scan(tmp_path / name)))
     assert len(surface) <= 4000 and surface.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(surface, axis=1), 1 / 1.03, atol=0.01)
 
@@ -263,7 +264,7 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch, run):
     for name in ("sdfhub.viewer.page", "sdfhub.viewer.loopback"):
         monkeypatch.delitem(sys.modules, name)
     with pytest.raises(SdfhubError, match=r"pip install 'sdfhub\[view\]'"):
-        view_task.view({"run": str(run), "port": 0, "resolution": 32})
+        view_task.view(composed(f"run={run}", "port=0", "resolution=32", config_name="view"))
 
 
 @pytest.mark.parametrize(
@@ -271,5 +272,6 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch, run):
     [("port", 70000), ("port", "x"), ("resolution", 4), ("resolution", 10**6), ("run", "nowhere")],
 )
 def test_a_wrong_setting_is_one_line(key, value, run):
+    config = composed(f"run={run}", "port=0", "resolution=32", f"{key}={value}", config_name="view")
     with pytest.raises(SdfhubError, match=f"{key}=|nowhere"):
-        view_task.view({"run": str(run), "port": 0, "resolution": 32, key: value})
+        view_task.view(config)

@@ -1,9 +1,13 @@
-"""Items streamed through worker processes; light imports, since a worker repeats them."""
+"""Items mapped over worker processes; light imports, since a worker repeats them."""
 
 import os
+import signal
+import subprocess
 import sys
+import time
+from pathlib import Path
 
-from sdfhub.data.workers import THREADS, _startable, stream_in_processes
+from sdfhub.data.workers import SAFE_PATH, THREADS, Crashed, map_in_processes, stream_in_processes
 
 
 class DiesElsewhere:
@@ -18,6 +22,10 @@ class DiesElsewhere:
         return number**2
 
 
+def variable(name: str) -> str | None:
+    return os.environ.get(name)
+
+
 def test_a_stream_takes_items_one_by_one_keeps_their_order_and_survives_its_workers():
     taken = []
     items = (taken.append(number) or number for number in range(10))
@@ -27,16 +35,74 @@ def test_a_stream_takes_items_one_by_one_keeps_their_order_and_survives_its_work
     assert list(stream) == [number**2 for number in range(1, 10)]
 
 
-def test_what_other_threads_do_while_workers_start_stays(monkeypatch):
+def test_the_item_on_which_a_worker_dies_is_named_and_the_others_go_on():
+    results = dict(map_in_processes(DiesElsewhere(), list(range(12)), workers=2))
+    assert isinstance(results.pop(6), Crashed)
+    assert results == {number: number**2 for number in range(12) if number != 6}
+
+
+def test_workers_are_single_threaded_and_the_environment_here_stays(monkeypatch):
     monkeypatch.setenv(THREADS[0], "7")
-    monkeypatch.delenv(THREADS[1], raising=False)
-    monkeypatch.delenv("SDFHUB_SET_MEANWHILE", raising=False)
-    main = sys.modules["__main__"]
-    with _startable(len):
-        assert os.environ[THREADS[0]] == os.environ[THREADS[1]] == "1"
-        assert sys.modules["__main__"] is not main
-        monkeypatch.setenv("SDFHUB_SET_MEANWHILE", "yes")
-        monkeypatch.setitem(sys.modules, "imported_meanwhile", main)
-    assert os.environ[THREADS[0]] == "7" and THREADS[1] not in os.environ
-    assert os.environ["SDFHUB_SET_MEANWHILE"] == "yes" and "imported_meanwhile" in sys.modules
-    assert sys.modules["__main__"] is main
+    before = dict(os.environ)
+    results = dict(map_in_processes(variable, [*THREADS, *SAFE_PATH], workers=2))
+    assert set(results.values()) == {"1"} and dict(os.environ) == before
+
+
+SCRIPT = """
+import os, sys, time
+from sdfhub.data.workers import map_in_processes
+from tests.test_workers import DiesElsewhere
+print("ran", flush=True)
+for name in ("random", "loky", "struct"):  # in the current folder, not to be imported
+    open(name + ".py", "w").write("raise SystemExit('imported ' + __file__)")
+def slow(number):
+    print("started", os.getpid(), flush=True)
+    time.sleep(number)
+    return number
+print(sorted(result for _, result in map_in_processes(slow, [float(word) for word in sys.argv[1:]], 2)))
+"""
+
+
+def started(folder: Path, *seconds: str) -> subprocess.Popen:
+    """A script without `if __name__ == "__main__"` that maps a function of its own."""
+    (folder / "scripts").mkdir()
+    script = folder / "scripts" / "mine.py"
+    script.write_text(SCRIPT)
+    root = Path(__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": f"{root / 'src'}:{root}"}
+    return subprocess.Popen(
+        [sys.executable, str(script), *seconds],
+        cwd=folder,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+def test_a_script_without_a_guard_runs_once_and_nothing_of_its_folder_is_imported(tmp_path):
+    output, _ = started(tmp_path, "0", "0.1", "0.2").communicate(timeout=60)
+    assert output.count("ran") == 1 and output.endswith("[0.0, 0.1, 0.2]\n") and "imported" not in output
+
+
+def ended(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_workers_end_with_the_process_that_they_work_for(tmp_path):
+    for number in (signal.SIGKILL, signal.SIGINT):
+        folder = tmp_path / number.name
+        folder.mkdir()
+        with started(folder, "60", "60") as run:
+            assert run.stdout.readline() == "ran\n"
+            workers = [int(run.stdout.readline().split()[1]) for _ in range(2)]
+            assert not any(ended(pid) for pid in workers)
+            run.send_signal(number)
+            for _ in range(300):
+                if all(ended(pid) for pid in workers):
+                    break
+                time.sleep(0.1)
+            assert all(ended(pid) for pid in workers)

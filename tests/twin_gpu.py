@@ -18,13 +18,12 @@ from torch.utils.backend_registration import _DummyBackendModule, _setup_private
 from sdfhub.data.loading.batches import Augmentation, Loading
 from sdfhub.data.loading.resident import ResidentBatches
 from sdfhub.geometry.grid import Grid
-from sdfhub.latent.fitting import AdamFit, field_and_jacobian
-from sdfhub.latent.observed import Problem, Rows
-from sdfhub.latent.prior import GaussianPrior
+from sdfhub.latent.gaussian import Gaussian
+from sdfhub.latent.problem import Prior, Problem, Rows
 from sdfhub.latent.similarity import PoseRange
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks.run import build_autodecoder
-from tests.test_config import composed
+from sdfhub.model.losses import clamped_l1
+from tests.tiny import build_autodecoder, composed
 
 torch.utils.rename_privateuse1_backend("twin")
 GPU = torch.device("twin", 0)
@@ -54,7 +53,7 @@ class Stored:
 def model_of(experiment: str, *overrides: str) -> AutoDecoder:
     """A model for six shapes whose parameters and buffers are fakes on the device."""
     with torch._subclasses.fake_tensor.unset_fake_temporarily():
-        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6, steps=10)
+        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6)
     for module in model.modules():
         for name, parameter in module._parameters.items():
             if parameter is not None:
@@ -91,23 +90,24 @@ def train(experiment: str) -> None:
 
 
 def fit(experiment: str) -> None:
-    """Codes of shapes whose samples come from the CPU, by DeepSDF's recipe; what Gauss-Newton asks for."""
+    """A step of DeepSDF's recipe for codes of unseen shapes."""
     decoder = model_of(experiment).decoder.requires_grad_(False).eval()
-    recipe = AdamFit(steps=2, lr=1e-3, samples=8, spread=0.01, lambda_code=1e-4)
-    codes = recipe(decoder, lambda step: (torch.empty(2, 8, 3), torch.empty(2, 8)), [0, 1])
-    check([codes, *field_and_jacobian(decoder, torch.empty(2, 8, 3, device=GPU), codes)])
+    fitted = torch.empty(2, decoder.code_size, device=GPU, requires_grad=True)
+    loss = clamped_l1(decoder(torch.empty(2, 8, 3, device=GPU), fitted), torch.empty(2, 8, device=GPU), 0.1)
+    loss.backward()
+    check([fitted.grad])
 
 
 def reconstruct_scan(experiment: str) -> None:
     """The objective of a scan in a frame of its own."""
     model = model_of(experiment)
     decoder, codes = model.decoder.requires_grad_(False).eval(), model.codes.table.detach()
-    problem = Problem(decoder, GaussianPrior(0.1)(codes), 0.1, PoseRange(4, 10.0, 1.2, 0.1))
+    problem = Problem(decoder, [Prior(Gaussian.of(codes, 0.1), 1e-4)], 0.1, PoseRange(4, 10.0, 1.2, 0.1))
     low = torch.empty(2, 8, device=GPU)
-    rows = Rows(torch.empty(2, 8, 3, device=GPU), low, low, low > 0, low[:, 0], low[:, 0])
     turn = torch.zeros(2, dtype=torch.int64, device=GPU)
+    rows = Rows(torch.empty(2, 8, 3, device=GPU), low, low, low > 0, low[:, 0], turn)
     check(problem.about(rows, turn, problem.unknowns(codes[:2])))
-    check([problem.prior.draw(3, seed=0)])
+    check([Gaussian.of(codes, 0.1).sample(3)])
 
 
 def evaluate(experiment: str) -> None:

@@ -1,25 +1,43 @@
 """sdfhub: an experiment platform for neural signed distance functions."""
 
+import importlib
 import os
+from importlib.metadata import version
 from typing import Any
 
 # PyTorch's threads would keep a core busy for milliseconds after their work, while others wait for it
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
-from sdfhub.data.preparation.sampling import Preparation, prepare_mesh
-from sdfhub.errors import RejectedMesh, SdfhubError
-from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
+__version__ = version("sdfhub")
 
-__all__ = ["Frame", "NormalizedMesh", "Preparation", "RejectedMesh", "SdfhubError", "ShapeSamples"]
-__all__ += ["Space", "load", "prepare_mesh"]
+_MODULES = {
+    "Activation": "sdfhub.model.activations",
+    "AutoDecoder": "sdfhub.model.autodecoder",
+    "Decoder": "sdfhub.model.decoder",
+    "Encoding": "sdfhub.model.encodings",
+    "Frame": "sdfhub.shapes",
+    "NormalizedMesh": "sdfhub.shapes",
+    "Preparation": "sdfhub.data.preparation.settings",
+    "RejectedMesh": "sdfhub.errors",
+    "SdfDataModule": "sdfhub.data.loading",
+    "SdfhubError": "sdfhub.errors",
+    "ShapeSamples": "sdfhub.shapes",
+    "Source": "sdfhub.data.sources",
+    "Space": "sdfhub.space",
+    "load": "sdfhub.opening",
+    "prepare_mesh": "sdfhub.data.preparation.sampling",
+    "train": "sdfhub.training",
+}
+"""Where public names live. They are imported when they are first asked for: not all need PyTorch."""
 
-_LATER = {"Space": "sdfhub.space", "load": "sdfhub.tasks.opening"}
-"""What is imported when it is first asked for: the processes that prepare shapes need no model."""
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
-    return getattr(importlib.import_module(_LATER[name]), name)
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -4,25 +4,58 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = ("ckpt_path", "output_root", "callbacks.", "checkpoint.", "data.store", "data.workers")
-WHERE_NOT_WHAT += ("data.loader.workers", "data.loader.resident", "search.")
+WHERE_NOT_WHAT = (
+    "ckpt_path",
+    "paths.",
+    "debug",
+    "print_config",
+    "trust",
+    "searched",
+    "logger",
+    "validation.",
+)
+WHERE_NOT_WHAT += (
+    "data.store",
+    "data.workers",
+    "data.validation",
+    "data.loader.workers",
+    "data.loader.resident",
+)
+WHERE_NOT_WHAT += ("callbacks.mesh", "callbacks.slices", "callbacks.checkpoint", "callbacks.snapshots")
+WHERE_NOT_WHAT += (
+    "callbacks.progress",
+    "callbacks.learning_rate",
+    "callbacks.stop_on_signal",
+    "hparams_search.",
+)
 WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile", "computing.tinycudann")
 WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
-WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices")
-WHERE_NOT_WHAT += ("trainer.strategy", "trainer.num_nodes", "scale.mesh_every")
-"""Settings that say where and how watched a cell runs; its result is the same under any of them."""
+WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices", "trainer.strategy")
+WHERE_NOT_WHAT += (
+    "trainer.num_nodes",
+    "trainer.logger",
+    "trainer.callbacks",
+    "trainer.profiler",
+    "trainer.num_sanity",
+)
+WHERE_NOT_WHAT += (
+    "trainer.num_sanity",
+    "trainer.default_root_dir",
+    "trainer.check_val",
+    "trainer.val_check",
+    "trainer.limit_val",
+)
+"""Beginnings of keys that say where a run happens and how it is watched: they change no result.
 
+Other callbacks count: one that stops a training early decides its result.
+"""
 
 OF_THE_SEED = ("seed", "data.loader.seed")
 """Settings that follow from the seed."""
 
 
 def settings_digest(config: dict[str, Any]) -> str:
-    """10 hex digits that change with every setting that can change a run's result.
-
-    Args:
-        config: plain, as `config.yaml` of a run holds it.
-    """
+    """10 hex digits that change with every setting of a plain config that can change a run's result."""
     return hashlib.sha256(json.dumps(deciding(config), sort_keys=True, default=str).encode()).hexdigest()[:10]
 
 
@@ -33,7 +66,7 @@ def deciding(config: dict[str, Any]) -> dict[str, Any]:
 
 def flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Settings by dotted key; a list counts as one setting."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for key, value in node.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return found
+        settings |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return settings

@@ -202,6 +202,19 @@ class Observation:
         if (self.low > self.high).any() or not 0 <= self.noise < np.inf:
             raise ValueError("low must not lie above high, noise must be a number >= 0")
 
+    @classmethod
+    def of_samples(cls, points: np.ndarray, sdf: np.ndarray) -> "Observation":
+        """Signed samples: points [N, 3] and their distances [N], in random order."""
+        sdf = np.ascontiguousarray(sdf, np.float32)
+        points = np.ascontiguousarray(points, np.float32)
+        return cls(points, sdf, sdf, np.zeros(len(sdf), np.bool_))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether all distances are known, inside too: signed samples."""
+        is_known = not self.unsigned.any() and bool((self.low == self.high).all())
+        return is_known and bool(self.low.min() < 0)
+
 
 @dataclass(frozen=True)
 class Batch:

@@ -19,7 +19,7 @@ source's.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
 from typing import Any, Literal
@@ -30,14 +30,15 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesher import Mesh, mesh_fields
-from sdfhub.latent.distribution import CodeDistribution
-from sdfhub.latent.reconstruction import MapFit
+from sdfhub.latent.fitting import Fit, Fitted
+from sdfhub.latent.gauss_newton import GaussNewtonFit
+from sdfhub.latent.gaussian import Gaussian
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
 from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import Scan
-from sdfhub.scans.target import observed
-from sdfhub.shapes import NORMALIZED, Frame, check_id
+from sdfhub.shapes import NORMALIZED, Frame, Observation, check_id
 
 Array = np.ndarray | Tensor
 Shape = str | int | Array
@@ -54,10 +55,12 @@ class Space:
         ids: of the S shapes, in the order of the codes.
         frames: where shapes lie in their sources' frames, as far as it is known.
         up: the axis that points up in the source's frame, for pictures.
+        model: what its model is made of: plain data.
         config: what the training was composed of: plain data.
         metrics: what `metrics.json` of the run holds; None where nothing was judged.
-        evidence: what a scan of another shape says.
-        method: finds the code behind it.
+        delta: clamp of distances in the training; codes of other shapes are fitted under the same.
+        evidence: makes observations of scans.
+        fitter: finds the codes behind observations.
     """
 
     decoder: Decoder
@@ -65,10 +68,12 @@ class Space:
     ids: tuple[str, ...]
     frames: Mapping[str, Frame]
     up: Literal["y", "z"]
+    model: dict[str, Any]
     config: dict[str, Any]
     metrics: dict[str, Any] | None
-    evidence: Evidence
-    method: MapFit
+    delta: float = 0.1
+    evidence: Evidence = field(default_factory=Evidence)
+    fitter: Fit = field(default_factory=GaussNewtonFit)
 
     def __repr__(self) -> str:
         return f"Space({len(self.ids)} shapes, codes of {self.codes.shape[1]} numbers, {self.up} up)"
@@ -185,7 +190,7 @@ class Space:
         points: Array,
         normals: Array | None = None,
         sdf: Array | None = None,
-        frame: Literal["shape", "normalised"] = "normalised",
+        frame: Literal["shape", "normalised"] | Frame = "normalised",
         seed: int = 0,
     ) -> Tensor:
         """The code [L] of a shape that the space has not seen, by MAP estimation.
@@ -194,7 +199,8 @@ class Space:
             points: [N, 3]: all over the surface where `sdf` is not given.
             normals: [N, 3] outward normals of surface points.
             sdf: [N] signed distances at the points, negative inside, of both sides.
-            frame: of surface points: normalised, or shape, where their own bounding box tells it.
+            frame: in which the points lie: normalised; a known one, such as `space.frames[id]`; or shape,
+                where the bounding box of surface points tells it.
             seed: of the choice of points.
 
         Raises:
@@ -202,25 +208,34 @@ class Space:
         """
         if sdf is not None and normals is not None:
             raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
-        if frame not in ("shape", "normalised"):
-            raise SdfhubError(f"fit: frame={frame!r}: must be 'shape' or 'normalised'")
         try:
             scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
-        except (TypeError, ValueError) as error:
-            raise SdfhubError(f"fit: {error}") from error
-        try:
             return self.fit_scan(scan, frame, seed)
-        except SdfhubError as error:
+        except (TypeError, ValueError, SdfhubError) as error:
             raise SdfhubError(f"fit: {error}") from error
 
-    def fit_scan(self, scan: Scan, frame: Literal["shape", "normalised"], seed: int = 0) -> Tensor:
-        """The code [L] of a scanned shape, whose frame its own bounding box tells or is the normalised one.
+    def fit_scan(
+        self, scan: Scan, frame: Literal["shape", "normalised"] | Frame = "shape", seed: int = 0
+    ) -> Tensor:
+        """The code [L] of a scanned shape.
+
+        Args:
+            scan: from a file or from arrays.
+            frame: as `fit` has it.
+            seed: of the choice of points.
 
         Raises:
             SdfhubError: the scan does not fit the frame, or its mesh cannot be trusted.
         """
-        target = observed(scan, self.evidence, frame, np.random.default_rng(seed))
-        return self.method(self.decoder, self.codes, [target.observation]).codes[0]
+        if not isinstance(frame, Frame) and frame not in ("shape", "normalised"):
+            raise SdfhubError(f"frame={frame!r}: must be 'shape', 'normalised' or a Frame")
+        frame = NORMALIZED if frame == "normalised" else frame
+        seen = observe(scan, self.evidence, frame, np.random.default_rng(seed))
+        return self.fit_observations([seen.observation]).codes[0]
+
+    def fit_observations(self, observations: Sequence[Observation]) -> Fitted:
+        """Codes [B, L] and residuals [B] of the shapes behind B observations in the normalised frame."""
+        return self.fitter(self.decoder, self.codes, observations, self.delta)
 
     def interpolate(self, a: Shape, b: Shape, steps: int) -> Tensor:
         """Codes [steps, L] in equal steps along the line from a to b, both included; steps >= 2."""
@@ -244,13 +259,12 @@ class Space:
         The squared distance over that of the known ones on average; some 5 to 10 for strangers.
         """
         codes = self.code(shape)
-        values = self.method.prior(self.codes).unusual(codes.reshape(-1, codes.shape[-1]))
-        return values.reshape(codes.shape[:-1])
+        return self.distribution.unusual(codes.reshape(-1, codes.shape[-1])).reshape(codes.shape[:-1])
 
     @cached_property
-    def distribution(self) -> CodeDistribution:
-        """A Gaussian fitted to the codes."""
-        return CodeDistribution.of(self.codes)
+    def distribution(self) -> Gaussian:
+        """The normal distribution of the codes."""
+        return Gaussian.of(self.codes)
 
     @property
     def principal_directions(self) -> Tensor:

@@ -2,11 +2,14 @@
 
 import hashlib
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+from sdfhub.errors import SdfhubError
 
 
 @contextmanager
@@ -24,17 +27,18 @@ def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
     part = path.with_name(beside or f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file:  # a link that lies there is not followed
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        if error.errno:  # a write that fails does not say where
+        if error.errno:  # a write that fails does not name its file
             error.filename = str(path)
         raise
     finally:
-        with suppress(OSError):  # what went wrong before is told, not this
+        with suppress(OSError):  # the first error is the one to report
             part.unlink()
 
 
@@ -42,6 +46,19 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """Writes a file, text as UTF-8, whole or not at all; see `whole_file`."""
     with whole_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """Makes a folder of results, before hours go into what should lie there.
+
+    Raises:
+        SdfhubError: nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise SdfhubError(f"{folder}: cannot be written ({(error.strerror or '').lower()})") from error
 
 
 def file_sha256(path: Path) -> str:

@@ -1,5 +1,6 @@
 """Checkpoints of a run: when they are written, and that each is there whole or not at all."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -8,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from sdfhub.checkpoint_file import LAST, read_checkpoint, write_checkpoint
+
+log = logging.getLogger(__name__)
 
 
 class WholeFileIO(TorchCheckpointIO):
@@ -28,52 +30,49 @@ class WholeFileIO(TorchCheckpointIO):
         return read_checkpoint(Path(path), map_location)
 
 
-class Snapshots(ModelCheckpoint):
-    """Checkpoints that stay, named after the epochs done: Lightning counts them from 0.
+class StopOnSignal(L.Callback):
+    """Ends a training that is told to stop after the step in hand, and keeps `last.ckpt` wherever one ends.
 
-    A class of its own, since Lightning tells the states of callbacks apart by class.
-    """
-
-    def format_checkpoint_name(self, metrics: dict[str, Any], *args: Any, **kwargs: Any) -> str:
-        return super().format_checkpoint_name(metrics | {"epoch": metrics["epoch"] + 1}, *args, **kwargs)
-
-
-class KeepLast(L.Callback):
-    """`last.ckpt` where a training ends: by itself, or told to by a signal, after the step in hand.
-
-    SIGTERM and SIGINT end the process with status 143 and 130, as the shell counts them; a second one ends
-    it at once. SIGUSR1 under SLURM (`sbatch --signal=USR1@120`) also has the job put back into the queue.
+    SIGTERM, SIGINT and SIGHUP end the process with status 143, 130 and 129, as the shell counts them; a
+    second signal ends it at once. SIGUSR1 under SLURM (`sbatch --signal=USR1@120`) also has the job put back
+    into the queue. With `accumulate_grad_batches` a step has several batches.
 
     Args:
-        folder: of the checkpoints.
+        dirpath: folder of the checkpoints.
     """
 
-    def __init__(self, folder: Path):
-        self.path = folder / LAST
-        self._told: int | None = None
-        self._before: dict[int, Any] = {}
+    def __init__(self, dirpath: str | Path):
+        self.path = Path(dirpath) / LAST
+        self._signal: int | None = None
+        self._handlers: dict[int, Any] = {}
+        self._step = 0
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        self._told = None
-        listened = [signal.SIGTERM, signal.SIGINT]
+        self._signal, self._step = None, trainer.global_step
+        numbers = [signal.SIGTERM, signal.SIGINT]
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
+            numbers.append(signal.SIGHUP)
         if "SLURM_JOB_ID" in os.environ:
-            listened.append(signal.SIGUSR1)
+            numbers.append(signal.SIGUSR1)
         if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
-            self._before = {number: signal.signal(number, self._tell) for number in listened}
+            self._handlers = {number: signal.signal(number, self._receive) for number in numbers}
 
-    def _tell(self, number: int, frame: Any) -> None:
-        if self._told is not None:
+    def _receive(self, number: int, frame: Any) -> None:
+        if self._signal is not None:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
-        self._told = number
-        print(f"{signal.Signals(number).name}: stopping after this step", flush=True)
+        self._signal = number
+        log.warning("%s: stopping after this step", signal.Signals(number).name)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
-        if not trainer.strategy.reduce_boolean_decision(self._told is not None, all=False):
+        before, self._step = self._step, trainer.global_step
+        if self._step == before:
+            return  # the gradient is still accumulated
+        if not trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
             return
-        trainer.save_checkpoint(self.path)
-        print(f"stopped after step {trainer.global_step}: {self.path}", flush=True)
-        number = self._told or signal.SIGTERM  # another process of the run was told
+        save_last(trainer, self.path)
+        log.warning("stopped after step %d: %s", trainer.global_step, self.path)
+        number = self._signal or signal.SIGTERM  # another process of the run received it
         if number == signal.SIGUSR1:
             subprocess.run(["scontrol", "requeue", os.environ["SLURM_JOB_ID"]], check=False)
             number = signal.SIGTERM
@@ -81,36 +80,20 @@ class KeepLast(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._stop_listening()
-        trainer.save_checkpoint(self.path)  # the last epoch need not have been one of every_n_epochs
-        if self._told is not None:
-            raise SystemExit(128 + self._told)
+        save_last(trainer, self.path)  # the last epoch need not have been one of every_n_epochs
+        if self._signal is not None:
+            raise SystemExit(128 + self._signal)
 
     def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
         self._stop_listening()
 
     def _stop_listening(self) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        self._before = {}
+        self._handlers = {}
 
 
-def checkpointing(folder: Path, every_n_epochs: int, snapshot_every_n_epochs: int | None) -> list[L.Callback]:
-    """`last.ckpt`, the newest state, and on demand snapshots `epoch_0500.ckpt` that stay.
-
-    A run continued from any of them is exact; on a GPU up to rounding, where its kernels add in any order.
-
-    Args:
-        folder: where they lie.
-        every_n_epochs: how often `last.ckpt` is written, >= 1.
-        snapshot_every_n_epochs: how often a snapshot is kept; None keeps none.
-    """
-    last = ModelCheckpoint(
-        folder, filename="last", every_n_epochs=every_n_epochs, enable_version_counter=False
-    )
-    if snapshot_every_n_epochs is None:
-        return [KeepLast(folder), last]
-    name = "epoch_{epoch:04d}"
-    snapshots = Snapshots(
-        folder, name, auto_insert_metric_name=False, save_top_k=-1, every_n_epochs=snapshot_every_n_epochs
-    )
-    return [KeepLast(folder), last, snapshots]
+def save_last(trainer: L.Trainer, path: Path) -> None:
+    """Writes the trainer's state, but in a `fast_dev_run`, which leaves no checkpoint."""
+    if not trainer.fast_dev_run:
+        trainer.save_checkpoint(path)

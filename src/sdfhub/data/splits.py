@@ -14,37 +14,43 @@ class Split:
     """Training and held-out shapes; no shape is in both."""
 
     train: list[Shape]
-    test: list[Shape]
+    held_out: list[Shape]
 
 
-def split(shapes: list[Shape], train: int | None, test: int, seed: int) -> Split:
-    """Train and test shapes, drawn evenly over the categories.
+def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_most: bool = False) -> Split:
+    """Training and held-out shapes, drawn evenly over the categories.
 
-    A seeded hash of its id orders the shapes of a category. Test shapes are taken from the front of
+    A seeded hash of its id orders the shapes of a category. Held-out shapes are taken from the front of
     that order and training shapes from its back, so that neither number changes the other side until
     the two meet, and a smaller `train` is a part of a larger one. Roles given by a split file hold: a
     side for which roles are given draws from those alone, the other from the shapes without a role.
 
     Args:
         shapes: what the source offers; the order does not matter.
-        train: number of training shapes; None takes all that are not test shapes.
-        test: number of held-out shapes.
+        train: number of training shapes; None takes all that are not held out.
+        held_out: number of held-out shapes.
         seed: another seed, another order.
+        at_most: the numbers are upper bounds. Where there are not enough shapes, or all are trained on, no
+            more than a fifth of them is held out, but one of three.
 
     Raises:
-        SdfhubError: fewer shapes than asked for.
+        SdfhubError: fewer shapes than asked for; with `at_most`, none to train on.
     """
-    if test < 0 or (train is not None and train < 0):
-        raise SdfhubError(f"split: the numbers of shapes must not be negative, got {train} and {test}")
+    if held_out < 0 or (train is not None and train < 0):
+        raise SdfhubError(f"split: the numbers of shapes must not be negative, got {train} and {held_out}")
     ordered = sorted(shapes, key=lambda shape: hashlib.sha256(f"{seed}:{shape.id}".encode()).digest())
     free = [shape for shape in ordered if shape.split is None]
-    held_out = _evenly([shape for shape in ordered if shape.split == "test"] or free)[:test]
-    taken = {shape.id for shape in held_out}
+    unseen = [shape for shape in ordered if shape.split == "held_out"] or free
     pool = [shape for shape in ordered if shape.split == "train"] or free
-    known = [shape for shape in _evenly(reversed(pool)) if shape.id not in taken]
-    if len(held_out) < test or len(known) < (train or 0) or (train is None and not known):
-        raise SdfhubError(_too_few(shapes, train, test))
-    return Split(train=known[:train], test=held_out)
+    if at_most and unseen is pool and (train is None or train + held_out > len(pool)):
+        held_out = min(held_out, max(len(pool) // 5, int(len(pool) >= 3)))
+    chosen = _evenly(unseen)[:held_out]
+    taken = {shape.id for shape in chosen}
+    rest = [shape for shape in _evenly(reversed(pool)) if shape.id not in taken]
+    is_short = len(chosen) < held_out or len(rest) < (train or 0)
+    if (is_short and not at_most) or (not rest and train != 0):
+        raise SdfhubError(_too_few(shapes, train, held_out))
+    return Split(train=rest[:train], held_out=chosen)
 
 
 def _evenly(shapes: Iterable[Shape]) -> list[Shape]:
@@ -56,9 +62,9 @@ def _evenly(shapes: Iterable[Shape]) -> list[Shape]:
     return [shape for shape in chain.from_iterable(rounds) if shape is not None]
 
 
-def _too_few(shapes: list[Shape], train: int | None, test: int) -> str:
+def _too_few(shapes: list[Shape], train: int | None, held_out: int) -> str:
     asked = "all others" if train is None else str(train)
     roles = [shape.split for shape in shapes]
-    given = f" ({roles.count('train')} train and {roles.count('test')} test by the split file)"
+    given = f" ({roles.count('train')} train and {roles.count('held_out')} held out by the split file)"
     there = f"{len(shapes)}{given if any(roles) else ''}"
-    return f"too few shapes: {asked} to train on and {test} to hold out are asked for, there are {there}"
+    return f"too few shapes: {asked} to train on and {held_out} to hold out are asked for, there are {there}"

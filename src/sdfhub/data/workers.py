@@ -1,21 +1,26 @@
-"""Functions mapped over worker processes; a worker that dies costs one item, not the rest."""
+"""Functions mapped over worker processes; a worker that dies costs one item, not the rest.
 
-import multiprocessing
+The processes are loky's: new interpreters, not forks of a caller that has threads, and they do not run the
+caller's main script again, so that it needs no `if __name__ == "__main__"`.
+"""
+
 import os
-import pickle
 import signal
-import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, MutableMapping
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
-from multiprocessing import connection
-from types import ModuleType
+from multiprocessing import resource_tracker
+
+from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
 """What tells the numeric libraries how many threads to start; read when they are imported."""
+
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""Keeps Python from importing modules of the current folder."""
 
 
 class Crashed:
@@ -28,8 +33,7 @@ def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[
     Args:
         function: picklable; its exceptions are raised here.
         items: picklable.
-        workers: processes, each with one thread. They are not forked from the caller, whose threads (a
-            trainer's, a notebook's) would make that unsafe.
+        workers: processes, each with one thread.
 
     Yields:
         Index and result; `Crashed` in place of the result where the worker died on that item.
@@ -37,19 +41,22 @@ def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[
     left = dict(enumerate(items))
     while left:
         try:
-            for index, result in _map_until_crash(function, left, workers):
+            for index, result in _in_pool(function, left, workers):
                 del left[index]
                 yield index, result
         except BrokenProcessPool:
-            # Whichever item killed its worker was among the first of those left: try these one at a time.
+            # The item that killed its worker was among the first of those left: try these one at a time.
             for index in list(left)[: 2 * workers]:
-                yield index, _alone(function, left.pop(index))
+                try:
+                    yield from _in_pool(function, {index: left.pop(index)}, 1)
+                except BrokenProcessPool:
+                    yield index, Crashed()
 
 
 def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[object]:
-    """function(item) of each item, in their order, worked out while the caller makes the next items.
+    """function(item) of each item, in their order, computed while the caller makes the next items.
 
-    At most two items a worker wait. Where a worker dies, what is left is worked out here.
+    At most two items a worker wait. Where a worker dies, what is left is computed here.
 
     Args:
         function: picklable; its exceptions are raised here.
@@ -60,16 +67,13 @@ def stream_in_processes(function: Callable, items: Iterable, workers: int) -> It
         yield from map(function, items)
         return
     waiting: deque[tuple[object, Future | None]] = deque()
-    pool = _pool(workers, function)
-    try:
+    with _pool(function, workers) as pool:
         for item in items:
-            waiting.append((item, _submitted(pool, function, item)))
+            waiting.append((item, _submitted(pool, item)))
             if len(waiting) > 2 * workers:
                 yield _result(function, *waiting.popleft())
         while waiting:
             yield _result(function, *waiting.popleft())
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def workers_worth(items: int, each: int) -> int:
@@ -78,10 +82,16 @@ def workers_worth(items: int, each: int) -> int:
     return workers if workers > 1 else 0
 
 
-def _submitted(pool: ProcessPoolExecutor, function: Callable, item: object) -> Future | None:
+def _in_pool(function: Callable, items: dict[int, object], workers: int) -> Iterator[tuple[int, object]]:
+    with _pool(function, workers) as pool:
+        futures = {pool.submit(_call, item): index for index, item in items.items()}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+def _submitted(pool: ProcessPoolExecutor, item: object) -> Future | None:
     try:
-        with _startable(function):
-            return pool.submit(_call, item)
+        return pool.submit(_call, item)
     except BrokenProcessPool:
         return None
 
@@ -93,36 +103,32 @@ def _result(function: Callable, item: object, future: Future | None) -> object:
         return function(item)
 
 
-def _map_until_crash(function: Callable, items: dict, workers: int) -> Iterator[tuple[int, object]]:
-    with _pool(workers, function) as pool:
-        try:
-            with _startable(function):
-                futures = {pool.submit(_call, item): index for index, item in items.items()}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+@contextmanager
+def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
+    with _safe_path():  # for the processes that clean up after the workers; started once
+        resource_tracker.ensure_running()
+        pool = ProcessPoolExecutor(
+            workers,
+            env=dict.fromkeys(THREADS, "1") | SAFE_PATH,
+            initializer=_start,
+            initargs=(function, os.getpid()),
+        )
+    try:
+        yield pool
+    finally:
+        pool.shutdown(kill_workers=True)
 
 
-def _alone(function: Callable, item: object) -> object:
-    with _pool(1, function) as pool:
-        try:
-            with _startable(function):
-                future = pool.submit(_call, item)
-            return future.result()
-        except BrokenProcessPool:
-            return Crashed()
-
-
-def _pool(workers: int, function: Callable) -> ProcessPoolExecutor:
-    methods = multiprocessing.get_all_start_methods()
-    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
-    if multiprocessing.get_start_method(allow_none=True) not in (None, *methods):
-        # a worker of joblib's starts processes in a way of its own, which ours would be told to take up
-        multiprocessing.set_start_method(context.get_start_method(), force=True)
-    if context.get_start_method() == "forkserver":  # imports once what each worker would import
-        context.set_forkserver_preload([function.__module__])
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(function,))
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    before = {key: os.environ[key] for key in SAFE_PATH if key in os.environ}
+    os.environ.update(SAFE_PATH)
+    try:
+        yield
+    finally:
+        for key in SAFE_PATH.keys() - before:
+            del os.environ[key]
+        os.environ.update(before)
 
 
 _function: Callable | None = None
@@ -133,38 +139,15 @@ def _call(item: object) -> object:
     return _function(item)
 
 
-def _start(function: Callable) -> None:
-    """Sets a worker up, and ends it when its parent is killed: the queue alone would keep it waiting."""
+def _start(function: Callable, parent: int) -> None:
     global _function
     _function = function
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    parent = multiprocessing.parent_process()
-    threading.Thread(target=lambda: (connection.wait([parent.sentinel]), os._exit(1)), daemon=True).start()
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
-@contextmanager
-def _startable(function: Callable) -> Iterator[None]:
-    """Lets workers start single-threaded and, unless the function needs it, without the main script.
-
-    Python runs the main script again in every worker: seconds of imports for a trainer, and no start at
-    all for a script without an `if __name__ == "__main__"`.
-    """
-    needs_main = b"__main__" in pickle.dumps(function)
-    main = sys.modules["__main__"] if needs_main else ModuleType("__main__")
-    with _lent(os.environ, dict.fromkeys(THREADS, "1")), _lent(sys.modules, {"__main__": main}):
-        yield
-
-
-@contextmanager
-def _lent(mapping: MutableMapping, entries: dict) -> Iterator[None]:
-    """Entries for a while. Others stay as they are: threads may import modules or set variables meanwhile."""
-    before = {key: mapping[key] for key in entries if key in mapping}
-    mapping.update(entries)
-    try:
-        yield
-    finally:
-        for key in entries:
-            if key in before:
-                mapping[key] = before[key]
-            else:
-                mapping.pop(key, None)
+def _end_with(parent: int) -> None:
+    """Ends this process when its parent has been killed: the queue alone would keep it waiting."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)

@@ -1,29 +1,23 @@
 """Nonlinearities of the decoder, one instance per hidden layer.
 
-Each rival is a module with three duties: `forward`; `with_slope`, the same beside its derivative, from which
-the decoder computes spatial gradients; and `weight_bound`, the half-width of the uniform distribution from
-which the weights of the linear layer before it are drawn. `shifted` is where a rival may be faster than its
-plain formula: it adds the code's share of the layer's output and applies the activation.
+A rival needs `forward` alone. It may also state its slope (`with_slope`, autograd's by default) and how the
+linear layer before it is initialised (`weight_bound`, `bias_bound`; PyTorch's law by default).
 """
 
+import copy
+import inspect
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
-from sdfhub.model.fast.dropout import kept
-from sdfhub.model.fast.loops import fits
-from sdfhub.model.fast.rectifier import Rectifier
-from sdfhub.model.fast.waves import Wave
+from sdfhub.described import Described
+from sdfhub.model.derivatives import value_and_slope
 
 
-def joined(hidden: Tensor, beside: Tensor | None) -> Tensor:
-    """[hidden | beside], [B, N, W + F] with the dtype of `hidden`, which alone is returned for None."""
-    return hidden if beside is None else torch.cat([hidden, beside.to(hidden.dtype)], dim=-1)
-
-
-class Activation(nn.Module, ABC):
+class Activation(Described, nn.Module, ABC):
     """An elementwise nonlinearity that knows how the layer before it must be initialised.
 
     Args:
@@ -35,36 +29,16 @@ class Activation(nn.Module, ABC):
         self.first = first
 
     @abstractmethod
+    def forward(self, x: Tensor) -> Tensor:
+        """a(x), shaped like x and twice differentiable."""
+
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """a(x) and a'(x), both shaped like x and both differentiable."""
+        return value_and_slope(self, x)
 
-    def shifted(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> Tensor:
-        """[a(product + shift) | beside], [B, N, W + F] with the dtype of `product`.
-
-        Args:
-            product: [B, N, W].
-            shift: [W] or [B, 1, W] float32.
-            beside: [B, N, F], what the next layer reads beside this one; None for nothing, F = 0.
-            dropout: probability in [0, 1) that a hidden unit is 0; the others are divided by 1 - dropout.
-        """
-        value = self(product + shift).to(product.dtype)
-        return joined(value * kept(value, dropout) if dropout else value, beside)
-
-    def shifted_with_slope(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> tuple[Tensor, Tensor]:
-        """As `shifted`, and a'(product + shift) [B, N, W], dropped alike."""
-        value, slope = (each.to(product.dtype) for each in self.with_slope(product + shift))
-        if dropout:
-            factors = kept(value, dropout)
-            value, slope = value * factors, slope * factors
-        return joined(value, beside), slope
-
-    @abstractmethod
     def weight_bound(self, fan_in: int) -> float:
         """Half-width b of U(-b, b), the initial weights of the layer before, for `fan_in` inputs."""
+        return 1 / math.sqrt(fan_in)
 
     def bias_bound(self) -> float | None:
         """Half-width of the initial biases before it; None keeps PyTorch's, U(+-1/sqrt(fan_in))."""
@@ -75,31 +49,64 @@ class Activation(nn.Module, ABC):
         return {}
 
 
-class Relu(Activation):
-    """max(0, x), initialised as PyTorch's linear layers are (DeepSDF's choice)."""
+class Elementwise(Activation):
+    """Any module that acts on each number by itself, such as `torch.nn.GELU`, as an activation.
 
-    def weight_bound(self, fan_in: int) -> float:
-        return 1 / math.sqrt(fan_in)
+    Args:
+        function: the module.
+        first: whether it follows the layer that reads the encoded points.
+    """
+
+    def __init__(self, function: nn.Module, first: bool = False):
+        super().__init__(first)
+        self.function = function
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.function(x)
+
+
+def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> Activation:
+    """One layer's activation of a class, a partial or a factory; of a module, which is copied.
+
+    Args:
+        make: called with `first` where it takes such an argument.
+        first: whether it follows the layer that reads the encoded points.
+
+    Raises:
+        ValueError: it makes no module.
+    """
+    if isinstance(make, nn.Module):
+        made = copy.deepcopy(make)
+    else:
+        arguments = inspect.signature(make).parameters
+        kind = getattr(make, "func", make)
+        is_ours = isinstance(kind, type) and issubclass(kind, Activation)  # every module takes **kwargs
+        takes_first = "first" in arguments or (is_ours and "kwargs" in arguments)
+        made = make(first=first) if takes_first else make()
+    if not isinstance(made, nn.Module):
+        raise ValueError(f"activation must make a torch.nn.Module, got {type(made).__name__}")
+    return made if isinstance(made, Activation) else Elementwise(made, first)
+
+
+def require_positive(**values: float) -> None:
+    """Refuses arguments that are not positive numbers.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    for name, value in values.items():
+        if isinstance(value, str) or not value > 0:
+            raise ValueError(f"{name} must be positive, got {value!r}")
+
+
+class Relu(Activation):
+    """max(0, x), DeepSDF's choice."""
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.relu(x)
 
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         return torch.relu(x), (x > 0).to(x.dtype)
-
-    def shifted(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> Tensor:
-        if not fits(product):
-            return super().shifted(product, shift, beside, dropout)
-        return Rectifier.apply(product, shift, beside, dropout, False)
-
-    def shifted_with_slope(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> tuple[Tensor, Tensor]:
-        if not fits(product):
-            return super().shifted_with_slope(product, shift, beside, dropout)
-        return Rectifier.apply(product, shift, beside, dropout, True)
 
 
 class Siren(Activation):
@@ -115,10 +122,8 @@ class Siren(Activation):
 
     def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
         super().__init__(first)
+        require_positive(omega_0=omega_0, omega_hidden=omega_hidden)
         self.omega = omega_0 if first else omega_hidden
-        self.register_parameter("log_beta", None)  # a plain sine has no sharpness
-        if self.omega <= 0:
-            raise ValueError(f"omega_0 and omega_hidden must be positive, got {self.omega}")
 
     def weight_bound(self, fan_in: int) -> float:
         return 1 / fan_in if self.first else math.sqrt(6 / fan_in) / self.omega
@@ -129,20 +134,6 @@ class Siren(Activation):
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         angle = self.omega * x
         return torch.sin(angle), self.omega * torch.cos(angle)
-
-    def shifted(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> Tensor:
-        if dropout or not fits(product):
-            return super().shifted(product, shift, beside, dropout)
-        return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, False)
-
-    def shifted_with_slope(
-        self, product: Tensor, shift: Tensor, beside: Tensor | None = None, dropout: float = 0.0
-    ) -> tuple[Tensor, Tensor]:
-        if dropout or not fits(product):
-            return super().shifted_with_slope(product, shift, beside, dropout)
-        return Wave.apply(product, shift, self.log_beta, beside, self.omega, self.with_slope, True)
 
     def monitored(self) -> dict[str, float]:
         return {"omega": self.omega}
@@ -168,8 +159,7 @@ class Hosc(Siren):
         self, omega_0: float, omega_hidden: float, beta: float, learn_beta: bool = True, first: bool = False
     ):
         super().__init__(omega_0, omega_hidden, first)
-        if beta <= 0:
-            raise ValueError(f"beta must be positive, got {beta}")
+        require_positive(beta=beta)
         self.log_beta = nn.Parameter(torch.tensor(math.log(beta)), requires_grad=learn_beta)
 
     @property
@@ -189,7 +179,7 @@ class Hosc(Siren):
         return {"omega": self.omega, "beta": self.beta.item()}
 
 
-class Finer(Activation):
+class Finer(Siren):
     """sin(omega (|x| + 1) x): a sine whose frequency grows away from zero, so that biases choose frequencies.
 
     Initialised as SIREN is, but for the first layer's biases, which are spread over U(-k, k). The authors'
@@ -206,13 +196,9 @@ class Finer(Activation):
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, k: float, first: bool = False):
-        super().__init__(first)
-        self.omega, self.k = omega_0 if first else omega_hidden, k
-        if min(self.omega, k) <= 0:
-            raise ValueError(f"omega_0, omega_hidden and k must be positive, got {self.omega} and {k}")
-
-    def weight_bound(self, fan_in: int) -> float:
-        return 1 / fan_in if self.first else math.sqrt(6 / fan_in) / self.omega
+        super().__init__(omega_0, omega_hidden, first)
+        require_positive(k=k)
+        self.k = k
 
     def bias_bound(self) -> float | None:
         return self.k if self.first else None
@@ -225,12 +211,9 @@ class Finer(Activation):
         angle = self.omega * (size + 1) * x
         return torch.sin(angle), self.omega * (2 * size + 1) * torch.cos(angle)
 
-    def monitored(self) -> dict[str, float]:
-        return {"omega": self.omega}
-
 
 class Gauss(Activation):
-    """exp(-x^2 / (2 a^2)), initialised as PyTorch's linear layers are.
+    """exp(-x^2 / (2 a^2)).
 
     Source: Ramasinghe and Lucey 2022; they draw weights by several laws and find that it matters
     little for this activation.
@@ -242,12 +225,8 @@ class Gauss(Activation):
 
     def __init__(self, a: float, first: bool = False):
         super().__init__(first)
-        if a <= 0:
-            raise ValueError(f"a must be positive, got {a}")
+        require_positive(a=a)
         self.a = a
-
-    def weight_bound(self, fan_in: int) -> float:
-        return 1 / math.sqrt(fan_in)
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.exp(-0.5 * (x / self.a).square())
@@ -257,7 +236,7 @@ class Gauss(Activation):
         return bump, -x / self.a**2 * bump
 
 
-class Wire(Activation):
+class Wire(Siren):
     """cos(omega x) exp(-(s x)^2), initialised as PyTorch's linear layers are.
 
     The real part of the complex Gabor wavelet exp(i omega x) exp(-|s x|^2), which would need complex weights.
@@ -274,13 +253,11 @@ class Wire(Activation):
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, s: float, first: bool = False):
-        super().__init__(first)
-        self.omega, self.s = omega_0 if first else omega_hidden, s
-        if min(self.omega, s) <= 0:
-            raise ValueError(f"omega_0, omega_hidden and s must be positive, got {self.omega} and {s}")
+        super().__init__(omega_0, omega_hidden, first)
+        require_positive(s=s)
+        self.s = s
 
-    def weight_bound(self, fan_in: int) -> float:
-        return 1 / math.sqrt(fan_in)
+    weight_bound = Activation.weight_bound
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cos(self.omega * x) * torch.exp(-(self.s * x).square())
@@ -289,6 +266,3 @@ class Wire(Activation):
         angle, bump = self.omega * x, torch.exp(-(self.s * x).square())
         wave = torch.cos(angle) * bump
         return wave, -self.omega * torch.sin(angle) * bump - 2 * self.s**2 * x * wave
-
-    def monitored(self) -> dict[str, float]:
-        return {"omega": self.omega}

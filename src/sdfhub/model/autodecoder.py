@@ -1,34 +1,44 @@
 """The LightningModule: wires decoder, codes, loss and optimiser, and logs. No formula lives here."""
 
+import math
 import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
 
 import lightning as L
 import torch
 from torch import Tensor
 
+from sdfhub.checkpoint_file import read_checkpoint
+from sdfhub.described import describe
 from sdfhub.errors import SdfhubError
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import Computing
 from sdfhub.model.fast.pieces import Parts, loss_in_pieces
-from sdfhub.model.losses import SdfLoss
-from sdfhub.model.optim import Adam
+from sdfhub.model.losses import Loss, SdfLoss
+from sdfhub.model.optimisers import Optimisation
+from sdfhub.model.saved import built_parts, model_with_weights
 from sdfhub.shapes import Batch
 
 
 class AutoDecoder(L.LightningModule):
     """A decoder and a table of codes, trained together on batches of shapes.
 
+    Its hyper-parameters are plain data, from which `load_from_checkpoint` makes the same objects.
+
     Source: Park et al. 2019, section 4.2; the paper's final loss.
 
     Args:
         decoder: f_theta(x, z).
-        codes: one row per training shape.
+        shapes: S, rows of the code table, >= 1; `SdfDataModule.rows` tells how many there are.
+        codes: makes the table, called with `shapes` and `size`.
         loss: the objective and its weights.
-        optim: makes the optimiser and its schedule.
-        steps: optimiser steps of the whole training, for the schedules. It is not asked of the trainer, whose
-            answer opens the data loader before a resumed run knows where it stands.
+        optim: makes the optimiser and its schedule; also a partial of an optimiser (`Optimisation.of`).
         computing: how steps are computed; by default as the device likes it.
+        validation: scores a shape of `val_dataloader`; None validates nothing.
         seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
             run repeats an uninterrupted one.
     """
@@ -36,19 +46,47 @@ class AutoDecoder(L.LightningModule):
     def __init__(
         self,
         decoder: Decoder,
-        codes: CodeTable,
-        loss: SdfLoss,
-        optim: Adam,
-        steps: int,
+        shapes: int,
+        codes: Callable[..., CodeTable] = CodeTable,
+        loss: Loss | None = None,
+        optim: Optimisation | partial | None = None,
         computing: Computing | None = None,
+        validation: Callable[..., dict[str, float]] | None = None,
         seed: int = 0,
     ):
         super().__init__()
-        self.computing = computing or Computing()
+        self.decoder, self.codes = decoder, codes(shapes=shapes, size=decoder.code_size)
+        self.loss, self.optim = loss or SdfLoss(), Optimisation.of(optim or Optimisation())
+        self.computing, self.validation, self.seed = computing or Computing(), validation, seed
+        parts = {"decoder": decoder, "codes": codes, "loss": self.loss, "optim": self.optim}
+        parts |= {"computing": self.computing, "validation": validation}
+        plain = {name: describe(part, name) for name, part in parts.items()}
+        self.save_hyperparameters({**plain, "shapes": shapes, "seed": seed}, logger=False)
+        self.steps = math.inf
         self._value, self._value_and_gradient = decoder.forward, decoder.value_and_gradient
-        self.decoder, self.codes = decoder, codes
-        self.loss, self.optim, self.steps, self.seed = loss, optim, steps, seed
         self._step_started = time.perf_counter()
+
+    @classmethod
+    def load_from_checkpoint(
+        cls, checkpoint_path: str | Path, map_location: Any = "cpu", trust: str | Sequence[str] = (), **_: Any
+    ) -> Self:
+        """The model of a checkpoint with its weights. Runs no code of the file.
+
+        Args:
+            checkpoint_path: that a training wrote, such as RUN/checkpoints/last.ckpt.
+            map_location: device of the weights.
+            trust: packages beside sdfhub whose classes the checkpoint may name.
+
+        Raises:
+            SdfhubError: a damaged file, a class of another package, or weights of another model.
+        """
+        path = Path(checkpoint_path)
+        content = read_checkpoint(path, map_location)
+        parameters, weights = content.get("hyper_parameters"), content.get("state_dict")
+        model = model_with_weights(
+            lambda: cls(**built_parts(parameters, path, trust)), parameters, weights, path
+        )
+        return model.to(map_location)
 
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of the shapes in table rows [B]."""
@@ -66,7 +104,8 @@ class AutoDecoder(L.LightningModule):
         self.computing.put_back()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        torch.manual_seed((self.seed << 32) + self.global_step)
+        batches = self.trainer.accumulate_grad_batches
+        torch.manual_seed((self.seed << 32) + self.global_step * batches + batch_idx % batches)
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -99,14 +138,30 @@ class AutoDecoder(L.LightningModule):
             _, gradients = self._value_and_gradient(batch.surface_points, codes)
         return self.loss.parts(predicted, batch.sdf, codes, gradients, batch.surface_normals, progress)
 
+    def validation_step(self, shape: Any, batch_idx: int) -> None:
+        """Scores one shape of `val_dataloader`: `val/...` of held-out shapes, `train/...` of known ones."""
+        if self.validation is None:
+            return
+        scores = self.validation(self.decoder, shape, self.codes.table)
+        role = "val" if shape.role == "held_out" else "train"
+        named = {f"{role}/{name}": value for name, value in scores.items()}
+        self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
+
     @property
     def progress(self) -> float:
         """Share of training done, in [0, 1]."""
-        return self.global_step / self.steps
+        return min(1.0, self.global_step / self.steps)
 
     def configure_optimizers(self):
+        self.steps = self.trainer.estimated_stepping_batches
+        # this has opened the data loader; a resumed training opens it again, once it knows its step
+        self.trainer.fit_loop._combined_loader = None
+        if math.isinf(self.steps):
+            raise SdfhubError(
+                "trainer.max_epochs: schedules and warm-ups are shares of a training; set it or max_steps"
+            )
         optimizer, schedule = self.optim.configure(
-            self.decoder.parameters(), self.codes.parameters(), self.steps
+            self.decoder.parameters(), self.codes.parameters(), int(self.steps)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -141,8 +196,6 @@ class AutoDecoder(L.LightningModule):
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
         values = {f"loss/{name}": part.detach() for name, part in parts.items()}
         values["codes/norm"] = self.codes.table[batch.rows].detach().norm(dim=-1).mean()
-        for group in self.optimizers().param_groups:
-            values[f"lr/{group['name']}"] = group["lr"]
         for index, activation in enumerate(self.decoder.activations):
             values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
         shared = self.trainer.world_size > 1  # processes then log the mean over their shares of the batch

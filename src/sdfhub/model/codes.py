@@ -5,8 +5,10 @@ import math
 import torch
 from torch import Tensor, nn
 
+from sdfhub.described import Described
 
-class CodeTable(nn.Module):
+
+class CodeTable(Described, nn.Module):
     """Learned codes, started at N(0, 1 / L), so that their expected norm is 1.
 
     Source: Park et al. 2019, section 4.2; `max_norm` as in its published code.

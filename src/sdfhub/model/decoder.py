@@ -1,83 +1,64 @@
 """The decoder f_theta(x, z): an MLP from encoded points and a shape's code to a signed distance."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
-from sdfhub.model.activations import Activation
-from sdfhub.model.encodings import Encoding
+from sdfhub.described import Described
+from sdfhub.model.activations import Activation, new_activation
+from sdfhub.model.conditioning import Concat, Layer, full_precision
+from sdfhub.model.dropout import dropout_factors
+from sdfhub.model.encodings import as_encoding
+from sdfhub.model.fast import waves
 
 HEAD_SPREAD = 0.03
 """Standard deviation of the initial output for hidden units of size 1: well inside the clamp delta = 0.1."""
 
 
-def full_precision(like: Tensor) -> AbstractContextManager:
-    """Keeps autocast, where there is any on the device of `like`, off what is computed inside."""
-    device = like.device.type
-    # a region without need is one that torch.export must write down, and it cannot write one inside another
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
-
-
-class Layer(nn.Module):
-    """A linear layer over [hidden | encoding | code] that never copies the code once per point.
-
-    The code's columns act once per shape; their result, with the bias, is broadcast over its points.
+def activated(
+    activation: Activation,
+    product: Tensor,
+    shift: Tensor,
+    beside: Tensor | None = None,
+    dropout: float = 0.0,
+    sloped: bool = False,
+) -> tuple[Tensor, Tensor | None]:
+    """[a(product + shift) | beside], [B, N, W + F], and the slope a'(product + shift), [B, N, W].
 
     Args:
-        hidden, encoding, code: number of input columns of each part; 0 leaves the part out.
-        outputs: number of output features.
+        activation: a.
+        product: [B, N, W].
+        shift: [W] or [B, 1, W] float32.
+        beside: [B, N, F], what the next layer reads beside the activation; None for nothing.
+        dropout: probability in [0, 1) that a unit and its slope are 0; others are divided by 1 - dropout.
+        sloped: whether the slope is wanted; else it is None.
 
-    Attributes:
-        joins_code: whether a code is among a layer's inputs, beside the hidden features.
+    Returns:
+        Both with the dtype of `product`.
     """
-
-    joins_code = True
-
-    def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
-        super().__init__()
-        self.columns = [hidden, encoding, code]
-        self.linear = nn.Linear(sum(self.columns), outputs)
-
-    def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Product [B, N, outputs] and the shift [B, 1, outputs] or [outputs] that is to be added to it.
-
-        Args:
-            inputs: [B, N, H + F], hidden features and encoded points.
-            codes: [B, L].
-        """
-        from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
-        shift = self.linear.bias
-        if self.columns[2]:
-            with full_precision(codes):  # one error here moves a whole shape
-                shift = F.linear(codes, from_code, self.linear.bias)[:, None]
-        if self.columns[0]:
-            return F.linear(inputs, from_points), shift
-        with full_precision(inputs):  # a place deserves all its digits too
-            return F.linear(inputs, from_points), shift
-
-    def pullback(self, cotangent: Tensor, codes: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Cotangents of hidden [B, N, H] and encoding [B, N, F], None where not read, from the output's.
-
-        Args:
-            codes: [B, L], for layers that are scaled by them; this one is not.
-        """
-        parts = self.linear.weight.split(self.columns, dim=1)[:2]
-        return tuple(cotangent @ part if part.shape[1] else None for part in parts)
+    if not dropout and waves.fits(activation, product):
+        return waves.wave(activation, product, shift, beside, sloped)
+    x = product + shift
+    value, slope = activation.with_slope(x) if sloped else (activation(x), None)
+    value, slope = value.to(product.dtype), None if slope is None else slope.to(product.dtype)
+    if dropout:
+        factors = dropout_factors(value, dropout)
+        value, slope = value * factors, None if slope is None else slope * factors
+    return value if beside is None else torch.cat([value, beside.to(value.dtype)], dim=-1), slope
 
 
-class Decoder(nn.Module):
+class Decoder(Described, nn.Module):
     """Signed distances of B shapes at N points each.
 
     Source: Park et al. 2019, figure 4 and its published code (re-injection shortens the layer before, so
     that every layer reads `width` features); the paper re-injects its encoding into every layer.
 
     Args:
-        encoding: maps points to F features.
-        activation: makes one activation per hidden layer, called with `first=True` for the first.
+        encoding: maps points to F features: an `Encoding`, or any module with an attribute `features`.
+        activation: makes one activation per hidden layer, called with `first=True` for the first where it
+            takes that; what it makes is an `Activation` or any elementwise module.
         code_size: L.
         depth: number of hidden layers, >= 1.
         width: W, features that a hidden layer reads and emits.
@@ -87,13 +68,13 @@ class Decoder(nn.Module):
         weight_norm: whether hidden layers are split into direction and length.
         dropout: probability in [0, 1) of dropping a hidden unit while training.
         tanh: whether the output passes through tanh, as in DeepSDF's code.
-        conditioning: class of the layers, which decides how a code enters them.
+        conditioning: class of the layers, or a partial of it: how a code enters them.
     """
 
     def __init__(
         self,
-        encoding: Encoding,
-        activation: Callable[..., Activation],
+        encoding: nn.Module,
+        activation: Callable[..., nn.Module],
         code_size: int,
         depth: int,
         width: int,
@@ -103,7 +84,7 @@ class Decoder(nn.Module):
         weight_norm: bool = True,
         dropout: float = 0.0,
         tanh: bool = False,
-        conditioning: type[Layer] = Layer,
+        conditioning: Callable[..., Layer] = Concat,
     ):
         super().__init__()
         if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
@@ -113,16 +94,17 @@ class Decoder(nn.Module):
             )
         if not set(inject_encoding) | set(inject_code) <= set(range(1, depth + 1)):
             raise ValueError(f"inject_encoding and inject_code name layers 1 to {depth}")
-        self.encoding, self.code_size = encoding, code_size
+        self.encoding, self.code_size = as_encoding(encoding), code_size
         self.dropout, self.tanh = dropout, tanh
-        self.activations = nn.ModuleList(activation(first=index == 0) for index in range(depth))
+        self.activations = nn.ModuleList(new_activation(activation, index == 0) for index in range(depth))
+        joins_code = getattr(conditioning, "func", conditioning).joins_code
         self.layers = nn.ModuleList()
         hidden = 0
         for index in range(depth + 1):
             encoded = encoding.features if index == 0 or index in inject_encoding else 0
             code = code_size if index == 0 or index in inject_code else 0
             after = encoding.features * (index + 1 in inject_encoding)
-            after += code_size * (index + 1 in inject_code) * conditioning.joins_code
+            after += code_size * (index + 1 in inject_code) * joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(
@@ -149,20 +131,24 @@ class Decoder(nn.Module):
 
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
-        with full_precision(points):  # a place deserves all its digits
+        with full_precision(points):  # bfloat16 cannot tell points apart
             encoded = self.encoding(points)
-        inputs, dropout = encoded, self.dropout if self.training else 0.0
+        return self._field(encoded, codes)[0]
+
+    def _field(
+        self, encoded: Tensor, codes: Tensor, sloped: bool = False
+    ) -> tuple[Tensor, list[Tensor | None]]:
+        """Signed distances [B, N] and each hidden layer's slopes [B, N, W], where wanted, else None."""
+        inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
             beside = encoded if following.columns[1] else None
-            inputs = activation.shifted(product, shift, beside, dropout)
-        return self._head(inputs, encoded, codes)
-
-    def _head(self, inputs: Tensor, encoded: Tensor, codes: Tensor) -> Tensor:
-        with full_precision(inputs):  # a distance deserves all its digits
+            inputs, slope = activated(activation, product, shift, beside, dropout, sloped)
+            slopes.append(slope)
+        with full_precision(inputs):  # nor distances
             product, shift = self.layers[-1](inputs.to(encoded.dtype), codes)
         sdf = (product + shift).squeeze(-1)
-        return torch.tanh(sdf) if self.tanh else sdf
+        return torch.tanh(sdf) if self.tanh else sdf, slopes
 
     def value_and_gradient(self, points: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distances [B, N] and their spatial gradients [B, N, 3] at points [B, N, 3].
@@ -176,16 +162,8 @@ class Decoder(nn.Module):
         """
         with full_precision(points):
             encoded, to_space = self.encoding.with_pullback(points)
-        inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
-        for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
-            product, shift = layer(inputs, codes)
-            beside = encoded if following.columns[1] else None
-            inputs, slope = activation.shifted_with_slope(product, shift, beside, dropout)
-            slopes.append(slope)
-        sdf = self._head(inputs, encoded, codes)
-        cotangent = torch.ones_like(sdf)[..., None]
-        if self.tanh:
-            cotangent = (1 - sdf * sdf)[..., None]
+        sdf, slopes = self._field(encoded, codes, sloped=True)
+        cotangent = (1 - sdf * sdf if self.tanh else torch.ones_like(sdf))[..., None]
         by_encoding = torch.zeros_like(encoded)
         for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
             by_hidden, part = layer.pullback(cotangent, codes)

@@ -1,8 +1,8 @@
 """Positional encodings gamma(x): points [..., 3] in the unit ball become features [..., F].
 
-Every rival is a module with an attribute `features` (F) and a `forward` that can be differentiated twice,
-because the normal loss differentiates the field's spatial gradient by the weights; and `with_pullback`, which
-states its Jacobian.
+A rival is a module with an attribute `features` (F) and a `forward` that can be differentiated twice, because
+the normal loss differentiates the field's spatial gradient by the weights. It may also state its Jacobian
+(`with_pullback`, autograd's by default).
 """
 
 import math
@@ -12,11 +12,17 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from sdfhub.described import Described
+from sdfhub.model.derivatives import value_and_pullback
+
 PRIMES = (1, 2_654_435_761, 805_459_861)
 """Factors of the spatial hash. Source: Mueller et al. 2022, section 3."""
 
+Pullback = Callable[[Tensor], Tensor]
+"""From a cotangent of the features [..., F] to one of the points [..., 3]."""
 
-class Encoding(nn.Module, ABC):
+
+class Encoding(Described, nn.Module, ABC):
     """A map from points to features.
 
     Attributes:
@@ -29,17 +35,37 @@ class Encoding(nn.Module, ABC):
     def forward(self, points: Tensor) -> Tensor:
         """Encodes points [..., 3], normalised frame, as [..., F]."""
 
-    @abstractmethod
-    def with_pullback(self, points: Tensor) -> tuple[Tensor, "Pullback"]:
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
         """Features [..., F] and the map of a cotangent v [..., F] to J(x)^T v [..., 3], differentiable."""
+        return value_and_pullback(self, points)
 
     def plain(self) -> "Encoding":
         """The encoding as tensor operations, with the same weights: itself, unless it is a faster twin."""
         return self
 
 
-Pullback = Callable[[Tensor], Tensor]
-"""What a cotangent of features is in space: [..., F] -> [..., 3]."""
+class OfModule(Encoding):
+    """Any module from points [..., 3] to features [..., F], with an attribute `features`, as an encoding."""
+
+    def __init__(self, module: nn.Module):
+        super().__init__()
+        self.module, self.features = module, module.features
+
+    def forward(self, points: Tensor) -> Tensor:
+        return self.module(points)
+
+
+def as_encoding(module: nn.Module) -> Encoding:
+    """The encoding itself, or a module as one.
+
+    Raises:
+        ValueError: it is no module, or has no number of features.
+    """
+    if isinstance(module, Encoding):
+        return module
+    if not isinstance(module, nn.Module) or not isinstance(getattr(module, "features", None), int):
+        raise ValueError("encoding must be a torch.nn.Module with an integer attribute `features`")
+    return OfModule(module)
 
 
 class Identity(Encoding):
@@ -54,7 +80,46 @@ class Identity(Encoding):
         return points, lambda cotangent: cotangent
 
 
-class Fourier(Encoding):
+class Waves(Encoding):
+    """sin and cos of angles that are linear in x: F = 2 A (+ 3), for A angles.
+
+    Args:
+        angles: A.
+        include_points: whether the coordinates themselves come first among the features.
+    """
+
+    def __init__(self, angles: int, include_points: bool):
+        super().__init__()
+        self.include_points = include_points
+        self.features = 2 * angles + 3 * include_points
+
+    @abstractmethod
+    def angles(self, points: Tensor) -> Tensor:
+        """[..., A] of points [..., 3]."""
+
+    @abstractmethod
+    def by_points(self, by_angles: Tensor) -> Tensor:
+        """The transpose of `angles`: [..., 3] of [..., A]."""
+
+    def forward(self, points: Tensor) -> Tensor:
+        angles = self.angles(points)
+        waves = [torch.sin(angles), torch.cos(angles)]
+        return torch.cat([points, *waves] if self.include_points else waves, dim=-1)
+
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        features = self(points)
+        first = 3 * self.include_points
+        sine, cosine = features[..., first:].chunk(2, dim=-1)
+
+        def pullback(cotangent: Tensor) -> Tensor:
+            by_sine, by_cosine = cotangent[..., first:].chunk(2, dim=-1)
+            by_points = self.by_points(by_sine * cosine - by_cosine * sine)
+            return by_points + cotangent[..., :3] if self.include_points else by_points
+
+        return features, pullback
+
+
+class Fourier(Waves):
     """sin(2^k pi x) and cos(2^k pi x) for k = 0 ... frequencies - 1, per axis: F = 6 frequencies (+ 3).
 
     Source: Mildenhall et al. 2020, equation 4; the paper's "FFT".
@@ -65,32 +130,19 @@ class Fourier(Encoding):
     """
 
     def __init__(self, frequencies: int, include_points: bool = False):
-        super().__init__()
+        super().__init__(3 * frequencies, include_points)
         if frequencies < 1:
             raise ValueError(f"frequencies must be at least 1, got {frequencies}")
-        self.include_points = include_points
-        self.features = 6 * frequencies + 3 * include_points
         self.register_buffer("octaves", math.pi * 2.0 ** torch.arange(frequencies), persistent=False)
 
-    def forward(self, points: Tensor) -> Tensor:
-        angles = (points[..., None] * self.octaves).flatten(-2)
-        waves = [torch.sin(angles), torch.cos(angles)]
-        return torch.cat([points, *waves] if self.include_points else waves, dim=-1)
+    def angles(self, points: Tensor) -> Tensor:
+        return (points[..., None] * self.octaves).flatten(-2)
 
-    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
-        features = self(points)
-        sine, cosine = features[..., 3 * self.include_points :].chunk(2, dim=-1)
-
-        def pullback(cotangent: Tensor) -> Tensor:
-            by_sine, by_cosine = cotangent[..., 3 * self.include_points :].chunk(2, dim=-1)
-            by_angle = by_sine * cosine - by_cosine * sine
-            by_point = by_angle.unflatten(-1, (3, -1)) @ self.octaves
-            return by_point + cotangent[..., :3] if self.include_points else by_point
-
-        return features, pullback
+    def by_points(self, by_angles: Tensor) -> Tensor:
+        return by_angles.unflatten(-1, (3, -1)) @ self.octaves
 
 
-class Gaussian(Encoding):
+class Gaussian(Waves):
     """sin(2 pi B x) and cos(2 pi B x) with rows of B drawn once from N(0, sigma^2): F = 2 rows.
 
     Source: Tancik et al. 2020, section 5. B is a buffer: it is saved with the weights.
@@ -101,25 +153,16 @@ class Gaussian(Encoding):
     """
 
     def __init__(self, rows: int, sigma: float):
-        super().__init__()
-        if rows < 1 or sigma <= 0:
+        super().__init__(rows, include_points=False)
+        if rows < 1 or not sigma > 0:
             raise ValueError(f"rows must be at least 1 and sigma positive, got {rows} and {sigma}")
-        self.features = 2 * rows
         self.register_buffer("directions", torch.randn(rows, 3) * sigma)
 
-    def forward(self, points: Tensor) -> Tensor:
-        angles = 2 * math.pi * points @ self.directions.T
-        return torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
+    def angles(self, points: Tensor) -> Tensor:
+        return 2 * math.pi * points @ self.directions.T
 
-    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
-        features = self(points)
-        sine, cosine = features.chunk(2, dim=-1)
-
-        def pullback(cotangent: Tensor) -> Tensor:
-            by_sine, by_cosine = cotangent.chunk(2, dim=-1)
-            return 2 * math.pi * (by_sine * cosine - by_cosine * sine) @ self.directions
-
-        return features, pullback
+    def by_points(self, by_angles: Tensor) -> Tensor:
+        return 2 * math.pi * by_angles @ self.directions
 
 
 class Hash(Encoding):
@@ -162,13 +205,8 @@ class Hash(Encoding):
         self.include_points, self.width = include_points, width
         self.features = levels * width + 3 * include_points
         self.table = nn.Parameter(torch.empty(sum(self.rows), width).uniform_(-1e-4, 1e-4))
-        first = torch.tensor([0, *self.rows]).cumsum(0)[:-1]
-        buffers = {
-            "cells": torch.tensor(cells),
-            "first": first,
-        }
-        for name, buffer in buffers.items():
-            self.register_buffer(name, buffer, persistent=False)
+        self.register_buffer("cells", torch.tensor(cells), persistent=False)
+        self.register_buffer("first", torch.tensor([0, *self.rows]).cumsum(0)[:-1], persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
         return self._encode(points)[0]

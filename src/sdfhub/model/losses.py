@@ -1,9 +1,17 @@
-"""The training objective: clamped L1 + prior of the codes + normal term, and its parts by name."""
+"""The training objective: clamped L1 + prior of the codes + normal term, and its parts by name.
 
-from dataclasses import dataclass
-from typing import Literal
+A rival is a subclass of `Loss` that overrides `__call__` or, to have its terms logged apart, `parts`.
+"""
 
+from typing import Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic.dataclasses import dataclass
 from torch import Tensor
+
+from sdfhub.described import Described
+
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 def clamped_l1(predicted: Tensor, target: Tensor, delta: float) -> Tensor:
@@ -42,9 +50,60 @@ def normal_term(gradients: Tensor, normals: Tensor) -> Tensor:
     return (gradients - normals).square().sum(dim=-1).mean()
 
 
-@dataclass(frozen=True)
-class SdfLoss:
-    """The weights of the objective, and the objective.
+class Loss(Described):
+    """What a training lowers.
+
+    Attributes:
+        delta: half-width of the band in which distances count, > 0, for what reads it beside the training:
+            the fit of unseen shapes and their error.
+    """
+
+    delta: float = 0.1
+
+    def wants_gradients(self, progress: float) -> bool:
+        """Whether spatial gradients are given at this share of training, in [0, 1]; they cost time."""
+        return False
+
+    def __call__(
+        self,
+        predicted: Tensor,
+        target: Tensor,
+        codes: Tensor,
+        gradients: Tensor | None,
+        normals: Tensor | None,
+        progress: float,
+    ) -> Tensor:
+        """The loss, a scalar; arguments as in `parts`."""
+        return sum(self.parts(predicted, target, codes, gradients, normals, progress).values())
+
+    def parts(
+        self,
+        predicted: Tensor,
+        target: Tensor,
+        codes: Tensor,
+        gradients: Tensor | None,
+        normals: Tensor | None,
+        progress: float,
+    ) -> dict[str, Tensor]:
+        """Weighted terms by name; their sum is the loss.
+
+        A large batch is worked on in pieces, so a term must be a mean: over samples or shapes, or, for a
+        term named `normal`, over surface points.
+
+        Args:
+            predicted: [B, N] field values.
+            target: [B, N] signed distances, normalised frame.
+            codes: [B, L].
+            gradients: [B, M, 3] spatial gradients on the surface, or None where they are not wanted.
+            normals: [B, M, 3] outward unit normals there, or None.
+            progress: share of training done, in [0, 1].
+        """
+        return {"objective": self(predicted, target, codes, gradients, normals, progress)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SdfLoss(Loss):
+    """Clamped L1 + lambda_code * prior of the codes + tau * normal term.
 
     Sums over points in the paper are means here, so that weights do not depend on the batch.
 
@@ -57,23 +116,14 @@ class SdfLoss:
         tau_start: share of training in [0, 1) before which tau is 0: normals cost time before they pay.
     """
 
-    delta: float
-    lambda_code: float
+    delta: PositiveFloat
+    lambda_code: NonNegativeFloat
     code_norm: Literal["squared", "l2"]
-    warmup: float
-    tau: float
-    tau_start: float = 0.0
-
-    def __post_init__(self):
-        if self.delta <= 0 or min(self.lambda_code, self.tau) < 0:
-            raise ValueError("delta must be positive; lambda_code and tau not negative")
-        if not 0 <= self.warmup <= 1:
-            raise ValueError(f"warmup must be in [0, 1], got {self.warmup}")
-        if not 0 <= self.tau_start < 1:
-            raise ValueError(f"tau_start must be in [0, 1), got {self.tau_start}")
+    warmup: Share
+    tau: NonNegativeFloat
+    tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
     def wants_gradients(self, progress: float) -> bool:
-        """Whether the normal term counts at this share of training."""
         return self.tau > 0 and progress >= self.tau_start
 
     def parts(
@@ -85,13 +135,7 @@ class SdfLoss:
         normals: Tensor | None,
         progress: float,
     ) -> dict[str, Tensor]:
-        """The weighted parts `sdf`, `code` and, where gradients are given, `normal`; their sum is the loss.
-
-        Args:
-            predicted: [B, N]; target: [B, N]; codes: [B, L].
-            gradients: [B, M, 3] or None; normals: [B, M, 3] or None.
-            progress: share of training done, in [0, 1], for the warm-up of the code prior.
-        """
+        """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
         parts = {
             "sdf": clamped_l1(predicted, target, self.delta),

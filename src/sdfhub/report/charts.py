@@ -1,158 +1,91 @@
-"""Charts as inline SVG: lines and dots that take their colours from the page, light or dark."""
+"""Charts of a report as SVG: the loss while training, and the Chamfer distance of each shape."""
 
-import math
-from dataclasses import dataclass
+import base64
+import io
+from pathlib import Path
 
-from markupsafe import Markup, escape
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-WIDTH, LEFT, RIGHT, BOTTOM = 760, 66, 14, 44
-"""Of every chart, in SVG units: room for the labels of its axes."""
+from sdfhub.report.rows import Group, Row
+
+STYLE = {"svg.fonttype": "none", "svg.hashsalt": "sdfhub", "font.family": "sans-serif", "font.size": 9}
+STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, "axes.spines.right": False}
+
+KEEP = {"scalars": 0, "images": 1, "audio": 1, "histograms": 1, "tensors": 1}
+"""Of each tag in an event file; 0 keeps all."""
 
 
-@dataclass(frozen=True)
-class Series:
-    """What a row shows in a chart.
+@matplotlib.rc_context(STYLE)
+def loss_chart(group: Group) -> str | None:
+    """Loss of signed distances by step, a line a seed, as a data URI; None where no run has kept it."""
+    figure = Figure((7.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for row in group.rows:
+        for number, curve in enumerate(filter(None, (loss_curve(cell.folder) for cell in row.done))):
+            label = _text(row.label) if number == 0 else None
+            axes.plot(*zip(*curve, strict=True), **_style(group, row), lw=1.3, label=label)
+    if not axes.lines:
+        return None
+    axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
+    axes.legend(frameon=False, fontsize=8)
+    return _data_uri(figure)
 
-    Args:
-        label: of the row.
-        colour: number of the row's colour on the page, 0 to 7.
-        hollow: dashed or hollow, for rows without normals.
-        values: (x, y) of a line, or (x, name) of dots.
+
+@matplotlib.rc_context(STYLE)
+def shape_chart(group: Group, role: str) -> str | None:
+    """CD of each shape of a role, a line of dots a row, all seeds, as a data URI; None without any.
+
+    A bar stands at each row's median, a dotted line at the noise floor; the worst shape is named.
     """
-
-    label: str
-    colour: int
-    hollow: bool
-    values: list[tuple[float, float | str]]
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Maps values to positions; logarithmic or linear."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    log: bool
-
-    def at(self, value: float) -> float:
-        scale = math.log10 if self.log else float
-        share = (scale(value) - scale(self.low)) / (scale(self.high) - scale(self.low))
-        return round(self.start + share * (self.end - self.start), 1)
-
-    def ticks(self) -> list[float]:
-        if not self.log:
-            step = 10 ** math.floor(math.log10(self.high - self.low))
-            step = next(step * f for f in (0.1, 0.2, 0.5, 1, 2) if (self.high - self.low) / (step * f) <= 7)
-            first = math.ceil(self.low / step)
-            return [step * k for k in range(first, math.floor(self.high / step) + 1)]
-        low, high = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
-        factors = (1, 2, 5) if high - low <= 3 else (1,)
-        found = [f * 10.0**k for k in range(low, high + 1) for f in factors]
-        found = [value for value in found if self.low <= value <= self.high]
-        return found if len(found) > 1 else [float(f"{value:.2g}") for value in self._spread(4)]
-
-    def _spread(self, count: int) -> list[float]:
-        """Values at even distances, where an axis is too short for round ones."""
-        ratio = self.high / self.low
-        return [self.low * ratio ** ((k + 0.5) / count) for k in range(count)]
+    shapes = group.shapes[(group.shapes["role"] == role) & (group.shapes["cd"] > 0)]
+    rows = [row for row in group.rows if (shapes["label"] == row.label).any()]
+    if not rows:
+        return None
+    figure = Figure((7.6, 0.8 + 0.3 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    for height, row in enumerate(rows):
+        line = shapes[shapes["label"] == row.label]
+        style, cds = _style(group, row), line["cd"].to_numpy()
+        spread = height + 0.035 * (np.arange(len(cds)) * 5 % 9 - 4)  # the same at every drawing
+        face = style["color"] if row.normals == "on" else "none"
+        axes.scatter(cds, spread, s=14, color=face, edgecolors=style["color"], alpha=0.7)
+        axes.vlines(np.median(cds), height - 0.35, height + 0.35, color=style["color"], lw=2.5)
+        place = {"xytext": (5, 0), "textcoords": "offset points", "fontsize": 7, "va": "center"}
+        axes.annotate(_text(line["shape"].iloc[cds.argmax()]), (cds.max(), spread[cds.argmax()]), **place)
+    axes.axvline(shapes["floor"].mean(), color="#5d6672", ls=":", lw=1)
+    axes.set(xscale="log", xlabel="CD times 10³ (dotted: noise floor)", ylim=(len(rows) - 0.5, -0.5))
+    axes.set_yticks(range(len(rows)), [_text(row.label) for row in rows])
+    return _data_uri(figure)
 
 
-def line_chart(series: list[Series], x_label: str, y_label: str, height: int = 320) -> Markup:
-    """Curves over a linear x axis and a logarithmic y axis; values at or below 0 are left out."""
-    lines = [[(x, y) for x, y in one.values if y > 0 and math.isfinite(y)] for one in series]
-    drawn = [point for line in lines for point in line]
-    if not drawn:
-        return Markup("")
-    xs, ys = [x for x, _ in drawn], [y for _, y in drawn]
-    across = _Axis(min(xs), max(max(xs), min(xs) + 1), LEFT, WIDTH - RIGHT, log=False)
-    up = _Axis(*_widened(min(ys), max(ys)), height - BOTTOM, 12, log=True)
-    parts = _frame(across, up, height, x_label, y_label)
-    for one, line in zip(series, lines, strict=True):
-        points = " ".join(f"{across.at(x)},{up.at(y)}" for x, y in line)
-        style = f"line c{one.colour}{' hollow' if one.hollow else ''}"
-        parts.append(
-            f'<polyline class="{style}" points="{points}"><title>{escape(one.label)}</title></polyline>'
-        )
-    return _svg(parts, height, y_label)
+def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tuple[int, float]]:
+    """A logged value by step where above 0, thinned out to so many points; [] where it cannot be read."""
+    folder = run / "tensorboard"
+    if not folder.resolve().is_relative_to(run.resolve()):
+        return []
+    try:
+        scalars = EventAccumulator(str(folder), size_guidance=KEEP).Reload().Scalars(tag)
+    except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
+        return []
+    found = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
+    return found[::-1][:: max(1, -(-len(found) // points))][::-1]
 
 
-def strip_chart(series: list[Series], x_label: str, marks: list[tuple[float, str]]) -> Markup:
-    """A line of dots per row over a logarithmic axis, a bar at its median, and marked values behind all.
-
-    Args:
-        series: rows; the second part of each value names its dot.
-        x_label: of the axis; values at or below 0 are left out.
-        marks: values with a name, such as a noise floor.
-    """
-    rows = [[(x, name) for x, name in one.values if x > 0 and math.isfinite(x)] for one in series]
-    xs = [x for row in rows for x, _ in row] + [x for x, _ in marks if x > 0]
-    if not xs:
-        return Markup("")
-    height, left = 26 * len(series) + BOTTOM + 20, 190
-    across = _Axis(*_widened(min(xs), max(xs)), left, WIDTH - RIGHT, log=True)
-    parts = _ticks_below(across, height, x_label)
-    for x, name in [mark for mark in marks if mark[0] > 0]:
-        place = across.at(x)
-        parts.append(f'<line class="mark" x1="{place}" x2="{place}" y1="14" y2="{height - BOTTOM}"/>')
-        parts.append(f'<text class="tick" x="{place}" y="10" text-anchor="middle">{escape(name)}</text>')
-    for k, (one, row) in enumerate(zip(series, rows, strict=True)):
-        middle = 30 + 26 * k
-        place = f'x="{left - 12}" y="{middle + 4}" text-anchor="end"'
-        parts.append(f'<text class="name" {place}>{escape(one.label)}</text>')
-        parts += _dots(one, row, across, middle)
-    return _svg(parts, height, x_label)
+def _style(group: Group, row: Row) -> dict[str, str]:
+    """A colour for each method; dashed without normals."""
+    methods = list(dict.fromkeys(other.method for other in group.rows))
+    return {"color": f"C{methods.index(row.method) % 10}", "ls": "-" if row.normals == "on" else "--"}
 
 
-def _dots(one: Series, row: list[tuple[float, str]], across: _Axis, middle: float) -> list[str]:
-    style = f"dot c{one.colour}{' hollow' if one.hollow else ''}"
-    parts = []
-    for k, (x, name) in enumerate(row):
-        offset = ((k * 5) % 9 - 4) * 1.3  # spread, the same at every drawing
-        told = f"<title>{escape(name)}: {x:.4g}</title>"
-        parts.append(
-            f'<circle class="{style}" cx="{across.at(x)}" cy="{middle + offset:.1f}" r="3">{told}</circle>'
-        )
-    if row:
-        values = sorted(x for x, _ in row)
-        half = len(values) // 2
-        median = values[half] if len(values) % 2 else (values[half - 1] + values[half]) / 2
-        place = across.at(median)
-        told = f"<title>median {median:.4g}</title>"
-        ends = f'x1="{place}" x2="{place}" y1="{middle - 10}" y2="{middle + 10}"'
-        parts.append(f'<line class="median c{one.colour}" {ends}>{told}</line>')
-    return parts
+def _text(text: str) -> str:
+    """A label of bearable length in which matplotlib finds no formulas."""
+    return (text if len(text) < 60 else f"{text[:58]}…").replace("$", r"\$")
 
 
-def _widened(low: float, high: float) -> tuple[float, float]:
-    return low / 1.15, high * 1.15
-
-
-def _frame(across: _Axis, up: _Axis, height: int, x_label: str, y_label: str) -> list[str]:
-    parts = _ticks_below(across, height, x_label)
-    for value in up.ticks():
-        y = up.at(value)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y}" y2="{y}"/>')
-        parts.append(f'<text class="tick" x="{LEFT - 8}" y="{y + 4}" text-anchor="end">{value:g}</text>')
-    turn = f'transform="translate(14 {(height - BOTTOM) / 2 + 6}) rotate(-90)"'
-    return [*parts, f'<text class="label" {turn} text-anchor="middle">{escape(y_label)}</text>']
-
-
-def _ticks_below(across: _Axis, height: int, label: str) -> list[str]:
-    base = height - BOTTOM
-    parts = [f'<line class="axis" x1="{across.start}" x2="{across.end}" y1="{base}" y2="{base}"/>']
-    for value in across.ticks():
-        x = across.at(value)
-        parts.append(f'<line class="grid" x1="{x}" x2="{x}" y1="14" y2="{base}"/>')
-        parts.append(f'<text class="tick" x="{x}" y="{base + 16}" text-anchor="middle">{value:g}</text>')
-    middle = (across.start + across.end) / 2
-    return [
-        *parts,
-        f'<text class="label" x="{middle}" y="{height - 6}" text-anchor="middle">{escape(label)}</text>',
-    ]
-
-
-def _svg(parts: list[str], height: float, label: str) -> Markup:
-    head = f'<svg class="chart" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(label)}">'
-    return Markup(head + "".join(parts) + "</svg>")
+def _data_uri(figure: Figure) -> str:
+    content = io.BytesIO()
+    figure.savefig(content, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(content.getvalue()).decode()

@@ -1,14 +1,16 @@
 """The meshes of a report in one frame: reconstructions of the cells and the truth behind them."""
 
+import base64
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import fast_simplification
 import numpy as np
 import trimesh
 
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.report.results import Cell, ShapeScore
 from sdfhub.shapes import RADIUS
 
@@ -37,19 +39,23 @@ def true_mesh(truth: StoredShape | None) -> Mesh | None:
     return Mesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
 
 
-def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> Mesh | None:
+def reconstruction(cell: Path, role: str, score: ShapeScore | None, truth: StoredShape | None) -> Mesh | None:
     """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
 
     Where the truth is not there to say what the frame was, the mesh's own extent does.
     """
     folder = cell / "meshes" / role
-    path = folder / f"{score.id}.ply"
-    if score.failed or not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+    path = folder / f"{score.id}.ply" if score and not score.failed else folder
+    if not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
-    read = _read_ply(path)
-    if read is None:
+    try:
+        with path.open("rb") as file:
+            mesh = trimesh.load_mesh(file, file_type="ply", process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
+            return None
+    except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
         return None
-    vertices, faces = read
     if truth is None:
         center = (vertices.min(0) + vertices.max(0)) / 2
         scale = RADIUS / max(np.linalg.norm(vertices - center, axis=1).max(), 1e-12)
@@ -58,12 +64,20 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
     return Mesh((vertices - center) * scale, faces, truth.up if truth else "z")
 
 
-def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    try:
-        with path.open("rb") as file:
-            mesh = trimesh.load_mesh(file, file_type="ply", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception:  # trimesh meets a broken file in many ways
-        return None
-    whole = len(faces) and np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)
-    return (vertices, faces) if whole else None
+def packed(mesh: Mesh, triangles: int) -> dict[str, int | str]:
+    """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
+
+    Returns:
+        `vertices` and `faces`: counts; `data`: positions times 32767 (int16), then indices (uint16).
+    """
+    vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+    if len(faces) > triangles:
+        vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))
+    if len(vertices) > 65_535:  # many loose triangles do not decimate
+        faces = faces[(faces < 65_535).all(axis=1)]
+        vertices = vertices[:65_535]
+    if mesh.up == "y":
+        vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
+    places = (np.clip(vertices, -1, 1) * 32767).astype("<i2").tobytes()
+    data = base64.b64encode(places + np.asarray(faces).astype("<u2").tobytes()).decode()
+    return {"vertices": len(vertices), "faces": len(faces), "data": data}

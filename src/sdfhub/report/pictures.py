@@ -2,19 +2,27 @@
 
 import base64
 import io
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from PIL import Image
 
 from sdfhub.data.workers import stream_in_processes, workers_worth
-from sdfhub.report.drawings import Drawing, Subject, drawn
-from sdfhub.report.meshes import FindTruth
-from sdfhub.report.results import ROLES, ShapeScore
-from sdfhub.report.rows import Group, Row
+from sdfhub.geometry.render import render
+from sdfhub.report.meshes import FindTruth, Mesh, packed, reconstruction, true_mesh
+from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
+from sdfhub.report.rows import Group
+
+PIXELS, PAPER = 208, 0.955
+"""Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
 
 FEWEST, MOST = 400, 4000
 """Triangles of a mesh to turn."""
+
+MESH_BYTES, TO_TURN = 4_000_000, 4
+"""Room for meshes on a page, and shapes to turn for each group."""
 
 A_WORKERS_WORTH = 32
 """Meshes for which it pays to start a process that draws them."""
@@ -22,43 +30,10 @@ A_WORKERS_WORTH = 32
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture.
+    """A picture [S, S, 3] uint8, None where there is nothing to draw, and the text below or in its place."""
 
-    Args:
-        drawing: what is seen; None where there is nothing to draw.
-        caption: below it.
-        alt: what stands in the place of a picture that is not there.
-    """
-
-    drawing: Drawing | None
-    caption: str
-    alt: str
-
-    @property
-    def image(self) -> np.ndarray | None:
-        """[S, S, 3] uint8; None where there is no surface or no file, and until it is drawn."""
-        return self.drawing and self.drawing.image
-
-
-@dataclass(frozen=True)
-class Turning:
-    """One shape to turn under the mouse: the truth and each row, by label.
-
-    Args:
-        name, role: of the shape.
-        drawings: by label.
-        triangles: of each, at most.
-    """
-
-    name: str
-    role: str
-    drawings: list[tuple[str, Drawing]]
-    triangles: int
-
-    def panels(self) -> list[dict]:
-        """The packed meshes of those that have one, for the viewer of the page."""
-        packs = [(label, drawing.packs.get(self.triangles)) for label, drawing in self.drawings]
-        return [{"label": label} | pack for label, pack in packs if pack]
+    image: np.ndarray | None
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,125 +44,117 @@ class Sheet:
     rows: list[tuple[str, list[Tile]]]
 
 
-@dataclass
 class Gallery:
-    """Says what is to be drawn, and then draws each mesh once.
+    """Pictures of the shapes of a report, each drawn once.
 
     Args:
         find_truth: prepared shapes by cell and id.
     """
 
-    find_truth: FindTruth
-    _drawings: dict[tuple, Drawing] = field(default_factory=dict)
+    def __init__(self, find_truth: FindTruth):
+        self.find_truth = find_truth
+        self._wanted: dict[tuple, Callable[[], Mesh | None]] = {}
+        self._images: dict[tuple, np.ndarray | None] = {}
 
-    def draw(self) -> None:
-        """Draws what was asked for since the last time, in as many processes as it is worth."""
-        left = [drawing for drawing in self._drawings.values() if not drawing.done]
-        workers = workers_worth(len(left), A_WORKERS_WORTH)
-        asked = [drawing.asked for drawing in left]
-        for drawing, found in zip(left, stream_in_processes(drawn, asked, workers), strict=True):
-            drawing.image, drawing.packs = found
-            drawing.done = True
+    def sheets(self, groups: list[Group], count: int) -> list[tuple[Sheet, Sheet]]:
+        """The contact sheet and the extremes of each group, drawn in as many processes as it is worth.
+
+        Made twice: first without pictures, which says what is to be drawn.
+        """
+        for _ in range(2):
+            sheets = [(self.sheet(group, count), self.extremes(group)) for group in groups]
+            left = {key: mesh for key, mesh in self._wanted.items() if key not in self._images}
+            workers = workers_worth(len(left), A_WORKERS_WORTH)
+            images = stream_in_processes(picture, list(left.values()), workers)
+            self._images |= dict(zip(left, images, strict=True))
+        return sheets
 
     def sheet(self, group: Group, count: int) -> Sheet:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
-        columns = [f"{id} ({'known' if role == 'known' else 'held out'})" for role, id in shown]
-        first = _first_done(group)
-        truth = [self._truth_tile(first, id, "") for _, id in shown]
-        rows = [("Ground truth", truth)] if any(tile.drawing for tile in truth) else []
+        cells = [row.first for row in group.rows if row.first]
+        rows = [("Ground truth", [self._truth_tile(cells[0], id) for _, id in shown])] if cells else []
+        rows = [row for row in rows if any(tile.image is not None for tile in row[1])]
         for row in group.rows:
-            absent = Tile(
-                None, "", "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
+            absent = Tile(None, "failed" if any(cell.state == "failed" for cell in row.cells) else "missing")
+            rows.append(
+                (row.label, [self._tile(row.first, *shape) if row.first else absent for shape in shown])
             )
-            tiles = [self._tile(row, role, id) if row.done else absent for role, id in shown]
-            rows.append((row.label, tiles))
-        return Sheet(columns, rows)
+        return Sheet([f"{id} ({role.replace('_', ' ')})" for role, id in shown], rows)
 
     def extremes(self, group: Group) -> Sheet:
-        """Best, median and worst known shape of each row, the truth beside each."""
-        names = ("best", "median", "worst")
-        columns = [text for name in names for text in (f"{name}: truth", name)]
+        """Best, median and worst training shape of each row, the truth beside each."""
         rows = []
         for row in group.rows:
-            shapes = row.done[0].scores.shapes.get("known", []) if row.done else []
-            if shapes:
-                ranked = sorted(shapes, key=lambda shape: shape.excess)
-                picked = (ranked[0], ranked[(len(ranked) - 1) // 2], ranked[-1])
-                tiles = [tile for shape in picked for tile in self._pair(row, shape)]
-                rows.append((row.label, tiles))
-        return Sheet(columns, rows)
+            scores = _scores(row.first, "train").values() if row.first else []
+            ids = [score.id for score in sorted(scores, key=lambda score: score.excess)]
+            for_row = [ids[0], ids[(len(ids) - 1) // 2], ids[-1]] if ids else []
+            tiles = [
+                (self._truth_tile(row.first, id, id), self._tile(row.first, "train", id)) for id in for_row
+            ]
+            rows += [(row.label, [tile for pair in tiles for tile in pair])] if tiles else []
+        return Sheet(["best: truth", "best", "median: truth", "median", "worst: truth", "worst"], rows)
 
-    def turning(self, group: Group, count: int, budget: int) -> list[Turning]:
-        """Some shapes, truth and rows, decimated for the viewer of the page.
+    def turning(self, groups: list[Group], count: int) -> list[list[dict]]:
+        """Some shapes of each group, truth and rows, decimated for the viewer of the page.
 
-        Args:
-            group: whose.
-            count: shapes at most.
-            budget: bytes for all of them.
+        Returns:
+            A dict a shape: `name`, `role` and `panels`, its meshes as `packed` with a `label` each.
         """
-        shown = chosen(group, count)
-        rows = [row for row in group.rows if row.done]
-        triangles = budget // max(1, len(shown) * (len(rows) + 1) * 12)  # some 12 bytes each, as base64
+        return [self._turning(group, min(count, TO_TURN), MESH_BYTES // len(groups)) for group in groups]
+
+    def _turning(self, group: Group, count: int, room: int) -> list[dict]:
+        shown, rows = chosen(group, count), [row for row in group.rows if row.first]
+        triangles = room // max(1, len(shown) * (len(rows) + 1) * 12)  # some 12 bytes each, as base64
         triangles = min(MOST, max(FEWEST, triangles))
-        found = []
+        shapes = []
         for role, id in shown:
-            drawings = [("Ground truth", self._truth(rows[0], id))]
-            for row in rows:
-                score = _score(row, role, id)
-                drawings.append((row.label, score and self._reconstruction(row, role, score)))
-            there = [(label, drawing.packed(triangles)) for label, drawing in drawings if drawing]
-            found.append(Turning(id, role.replace("_", " "), there, triangles))
-        return found
+            meshes = {"Ground truth": true_mesh(self.find_truth(rows[0].first, id))}
+            meshes |= {row.label: self._mesh(row.first, role, id)() for row in rows}
+            panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes.items() if mesh]
+            shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
+        return shapes
 
-    def _pair(self, row: Row, shape: ShapeScore) -> list[Tile]:
-        return [self._truth_tile(row, shape.id, shape.id), self._tile(row, "known", shape.id)]
+    def _mesh(self, cell: Cell, role: str, id: str) -> Callable[[], Mesh | None]:
+        """Reads the reconstruction of a shape, in whatever process."""
+        score = _scores(cell, role).get(id)
+        return partial(reconstruction, cell.folder, role, score, self.find_truth(cell, id))
 
-    def _tile(self, row: Row, role: str, id: str) -> Tile:
-        score = _score(row, role, id)
-        if score is None:
-            return Tile(None, "", "not judged")
-        caption = "no surface" if score.failed else f"CD {score.counted_cd * 1e3:.3f}"
-        alt = "no surface" if score.failed else "no mesh"
-        return Tile(self._reconstruction(row, role, score).pictured(), caption, alt)
+    def _tile(self, cell: Cell, role: str, id: str) -> Tile:
+        score = _scores(cell, role).get(id)
+        if score is None or score.failed:
+            return Tile(None, "no surface" if score else "not judged")
+        image = self._image((cell.folder, role, id), self._mesh(cell, role, id))
+        return Tile(image, "no mesh" if image is None else f"CD {score.counted_cd * TABLE_UNIT:.3f}")
 
-    def _reconstruction(self, row: Row, role: str, score: ShapeScore) -> Drawing:
-        folder = row.done[0].folder
-        key = (folder, role, score.id)
-        if key not in self._drawings:
-            truth = self.find_truth(row.done[0], score.id)
-            self._drawings[key] = Drawing(Subject(truth, folder, role, score))
-        return self._drawings[key]
+    def _truth_tile(self, cell: Cell, id: str, caption: str = "") -> Tile:
+        truth = self.find_truth(cell, id)
+        image = self._image(("truth", truth.fingerprint), partial(true_mesh, truth)) if truth else None
+        return Tile(image, "no truth" if image is None else caption)
 
-    def _truth(self, row: Row, id: str) -> Drawing | None:
-        truth = self.find_truth(row.done[0], id)
-        if truth is None or not truth.rows("faces"):
-            return None
-        return self._drawings.setdefault(("truth", truth.folder), Drawing(Subject(truth)))
-
-    def _truth_tile(self, row: Row, id: str, caption: str) -> Tile:
-        truth = self._truth(row, id)
-        return Tile(truth and truth.pictured(), caption, "no truth")
+    def _image(self, key: tuple, mesh: Callable[[], Mesh | None]) -> np.ndarray | None:
+        self._wanted[key] = mesh
+        return self._images.get(key)
 
 
-def _score(row: Row, role: str, id: str) -> ShapeScore | None:
-    """The score in the row's first finished seed."""
-    return next((score for score in row.done[0].scores.shapes.get(role, []) if score.id == id), None)
-
-
-def _first_done(group: Group) -> Row | None:
-    return next((row for row in group.rows if row.done), None)
+def picture(read_mesh: Callable[[], Mesh | None]) -> np.ndarray | None:
+    """[S, S, 3] uint8 of a mesh from the usual side; None without one."""
+    mesh = read_mesh()
+    return render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER) if mesh else None
 
 
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
-    """Role and id of the shapes to show: known ones, and up to a third held out, from the front of each."""
-    row = _first_done(group)
-    if row is None:
-        return []
-    known, unseen = ([shape.id for shape in row.done[0].scores.shapes.get(role, [])] for role in ROLES)
-    unseen = unseen[: max(count // 3, count - len(known))]
-    known = known[: count - len(unseen)]
-    return [("known", id) for id in known] + [("held_out", id) for id in unseen]
+    """Role and id of the shapes to show: the first training ones, and up to a third held out."""
+    cell = next((cell for row in group.rows for cell in row.done), None)
+    train, unseen = (list(_scores(cell, role)) if cell else [] for role in ROLES)
+    unseen = unseen[: max(count // 3, count - len(train))]
+    train = train[: count - len(unseen)]
+    return [("train", id) for id in train] + [("held_out", id) for id in unseen]
+
+
+def _scores(cell: Cell, role: str) -> dict[str, ShapeScore]:
+    """The scores of a role by id; {} where shapes have no surfaces to be judged by."""
+    return {s.id: s for s in cell.scores.shapes.get(role, []) if isinstance(s, ShapeScore)}
 
 
 def data_uri(image: np.ndarray) -> str:

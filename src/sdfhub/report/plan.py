@@ -4,7 +4,6 @@ A cell is one training. Its folder is named after all its settings, so cells of 
 seed lie side by side, and a cell whose settings have changed since is superseded, not overwritten.
 """
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -39,12 +38,12 @@ class PlannedCell(BaseModel):
 
     @property
     def identity(self) -> tuple:
-        """What the command line said: two cells that agree in it are one, under old and new defaults."""
+        """Choices, settings and seed: two cells that agree in them are one, under old and new defaults."""
         return tuple(sorted(self.choices.items())), tuple(sorted(self.settings.items())), self.seed
 
 
 class Plan(BaseModel):
-    """The content of `sweep.json`."""
+    """The content of `sweep.json`: the cells in the order of their commands, and these."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -54,7 +53,7 @@ class Plan(BaseModel):
 
 
 def read_plan(sweep: Path) -> Plan:
-    """What a sweep's folder consists of: its cells in the order of their commands, and these.
+    """What a sweep's folder consists of.
 
     Raises:
         SdfhubError: it is not a sweep's folder, or `sweep.json` is broken.
@@ -62,15 +61,12 @@ def read_plan(sweep: Path) -> Plan:
     try:
         return Plan.model_validate_json((sweep / PLAN).read_bytes())
     except OSError as error:
-        one_run = "; it is that of one run" if (sweep / "metrics.json").exists() else ""
         raise SdfhubError(
-            f"{sweep}: not the folder of a multirun, such as outputs/sweeps/table_small "
-            f"({PLAN}: {(error.strerror or 'unreadable').lower()}){one_run}"
+            f"{sweep}: not the folder of a multirun, such as outputs/sweeps/table_small: it has no {PLAN}"
         ) from error
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
-        raise SdfhubError(f"{sweep / PLAN}: {place}: {first['msg'].lower()}") from error
+        raise SdfhubError(f"{sweep / PLAN}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
 
 
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
@@ -81,10 +77,13 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None =
     sweep.mkdir(parents=True, exist_ok=True)
     with locked(sweep / ".lock"):
         old = read_plan(sweep) if (sweep / PLAN).exists() else Plan()
-        known = {cell.identity: cell for cell in (*old.cells, *cells)}
-        wordy_first = sorted(known.values(), key=lambda cell: -len(cell.settings))
-        shortest = {cell.folder: cell for cell in wordy_first}  # a default said or left out is one cell
-        by_folder = {cell.folder: shortest[cell.folder] for cell in known.values()}
+        latest = {cell.identity: cell for cell in (*old.cells, *cells)}
+        by_folder: dict[str, PlannedCell] = {}
+        for (
+            cell
+        ) in latest.values():  # of one folder, the cell that names fewest settings: others are defaults
+            rival = by_folder.setdefault(cell.folder, cell)
+            by_folder[cell.folder] = min(rival, cell, key=lambda one: len(one.settings))
         commands = dict.fromkeys([*old.commands, *([command[:2000]] if command else [])])
         plan = Plan(cells=list(by_folder.values()), commands=list(commands))
-        write_whole(sweep / PLAN, json.dumps(plan.model_dump(), indent=1).encode())
+        write_whole(sweep / PLAN, plan.model_dump_json(indent=1))

@@ -1,43 +1,43 @@
-"""What a cell left behind, read as plain data and checked: its scores, its cost, or why there are none."""
+"""What a cell left behind, read as plain data and checked: its scores, its cost, or why there are none.
+
+Nothing in a cell's files is run, and no link is followed out of its folder.
+"""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked
 from sdfhub.report.plan import FAILURE, PlannedCell, read_plan
+from sdfhub.settings import flat
 
 NOISE = 1e-6
-"""Excess that 30,000 points a side cannot tell from none."""
+"""Excess that 30,000 points a side cannot tell from none, normalised units squared."""
 
-ROLES = ("known", "held_out")
+ROLES = ("train", "held_out")
 
+TABLE_UNIT = 1e3
+"""Chamfer distances and errors of distances are shown times 10^3."""
 
-class _Read(BaseModel):
-    """Numbers must be finite; what a file says beside the fields is not looked at."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-
-Name = Annotated[str, StringConstraints(max_length=200)]
-
-Score = TypeVar("Score")
+Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=10**12)]
+Name = Annotated[str, StringConstraints(max_length=300)]
 
 
-class ShapeScore(_Read):
+class ShapeScore(BaseModel, frozen=True):
     """One judged shape: Chamfer distance, its noise floor, what a failure counts as, agreement of normals."""
 
-    id: str = Field(max_length=300)
-    cd: float | None
-    floor: float
-    cd_penalty: float
+    id: Name
+    cd: Number | None
+    floor: Number
+    cd_penalty: Number
     failed: bool
-    normal_consistency: float | None = None
+    normal_consistency: Number | None = None
 
     @property
     def counted_cd(self) -> float:
@@ -49,82 +49,64 @@ class ShapeScore(_Read):
         """What the Chamfer distance has above its noise floor."""
         return self.counted_cd - self.floor
 
+    def measures(self) -> dict[str, float | None]:
+        """What tables say of the shape, by name; distances times 10^3."""
+        distances = {"cd": self.counted_cd, "floor": self.floor, "excess": self.excess}
+        counts = {"normal_consistency": self.normal_consistency, "no_surface": float(self.failed)}
+        return {name: value * TABLE_UNIT for name, value in distances.items()} | counts
 
-class DistanceScore(_Read):
+
+class DistanceScore(BaseModel, frozen=True):
     """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
 
-    id: str = Field(max_length=300)
-    sdf_error: float
-    sign_accuracy: float
+    id: Name
+    sdf_error: Number
+    sign_accuracy: Number
+
+    def measures(self) -> dict[str, float | None]:
+        """What tables say of the shape, by name; distances times 10^3."""
+        return {"sdf_error": self.sdf_error * TABLE_UNIT, "sign_accuracy": self.sign_accuracy}
 
 
-class Training(_Read):
-    """The cost of a training, and versions and hardware by name, which old runs do not tell."""
+class Training(BaseModel, frozen=True):
+    """The cost of a training, and versions and hardware by name."""
 
-    seconds: float
-    steps: int
-    parameters: int
+    seconds: Number
+    steps: Count
+    parameters: Count
     made_with: dict[Name, Name] = {}
-
-
-class _Role(_Read, Generic[Score]):
-    shapes: list[Score]
-
-
-class _Metrics(_Read, Generic[Score]):
-    training: Training | None
-    known: _Role[Score] | None = None
-    held_out: _Role[Score] | None = None
-
-
-class _Augmentation(_Read):
-    copies: int = 0
-
-
-class _Loader(_Read):
-    shapes_per_step: int
-    samples_per_shape: int
-    augmentation: _Augmentation = _Augmentation()
-
-
-class _Data(_Read):
-    loader: _Loader
-
-
-class _Trainer(_Read):
-    max_epochs: int | None
-
-
-class _Config(_Read):
-    data: _Data
-    trainer: _Trainer
-
-
-class _Split(_Read):
-    train: list[str]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores and the cost of a finished cell.
+    """The scores of a finished cell.
 
     Args:
-        shapes: shapes judged by their surfaces, by role.
-        distances: shapes of a source without meshes, by role.
+        shapes: judged shapes by role.
         training: its cost.
-        epochs: passes that the trainer was asked for.
-        samples: signed samples drawn in all.
         trained_on: training shapes, without augmented copies.
         config: the content of `config.yaml`.
     """
 
-    shapes: dict[str, list[ShapeScore]]
-    distances: dict[str, list[DistanceScore]]
+    shapes: dict[str, list[ShapeScore] | list[DistanceScore]]
     training: Training
-    epochs: int | None
-    samples: int
     trained_on: int
-    config: dict
+    config: dict[str, Any]
+
+    def costs(self) -> dict[str, float | None]:
+        """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
+        costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
+        get = flat(self.config).get
+        try:
+            costs["epochs"] = min(int(get("trainer.max_epochs")), 10**12)
+            rows = self.trained_on * (1 + int(get("data.loader.augmentation.copies") or 0))
+            shapes = min(rows, int(get("data.loader.shapes_per_step")))
+            costs["samples"] = (
+                shapes * min(int(get("data.loader.samples_per_shape")), 10**12) * costs["steps"]
+            )
+        except (TypeError, ValueError, OverflowError):
+            pass  # a loader of the user's own
+        return costs
 
 
 @dataclass(frozen=True)
@@ -142,12 +124,12 @@ class Cell:
     plan: PlannedCell
     folder: Path
     state: Literal["done", "failed", "missing"]
-    reason: str
-    scores: Scores | None
+    reason: str = ""
+    scores: Scores | None = None
 
 
 def read_sweep(sweep: Path) -> list[Cell]:
-    """All planned cells of a sweep's folder; a broken one is told in a line, not raised.
+    """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing.
 
     Raises:
         SdfhubError: not a sweep's folder.
@@ -156,17 +138,20 @@ def read_sweep(sweep: Path) -> list[Cell]:
 
 
 def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
-    if is_locked(folder / ".lock"):
-        return Cell(plan, folder, "missing", "is being trained", None)
-    if (folder / FAILURE).exists():
-        return Cell(plan, folder, "failed", _failure(folder / FAILURE), None)
-    if not (folder / "metrics.json").exists():
-        begun = (folder / "config.yaml").exists()
-        return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run", None)
     try:
+        if not folder.resolve().is_relative_to(folder.parent.resolve()):
+            return Cell(plan, folder, "failed", "its folder is a link out of the sweep")
+        if is_locked(folder / ".lock"):
+            return Cell(plan, folder, "missing", "is being trained")
+        if (folder / FAILURE).exists():
+            reason = _loaded(folder, FAILURE).get("reason", "for a reason that was not written down")
+            return Cell(plan, folder, "failed", str(reason)[:500])
+        if not (folder / "metrics.json").exists():
+            begun = (folder / "config.yaml").exists()
+            return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
         return Cell(plan, folder, "done", "", read_scores(folder))
-    except SdfhubError as error:
-        return Cell(plan, folder, "failed", str(error), None)
+    except (SdfhubError, OSError) as error:
+        return Cell(plan, folder, "failed", str(error))
 
 
 def read_scores(folder: Path) -> Scores:
@@ -175,44 +160,37 @@ def read_scores(folder: Path) -> Scores:
     Raises:
         SdfhubError: a file is missing, broken or not what training writes.
     """
-    content = _loaded(folder / "metrics.json")
-    by_distance = any("sdf_error" in json.dumps(content.get(role, {}))[:2000] for role in ROLES)
-    kind = DistanceScore if by_distance else ShapeScore
-    metrics = _checked(_Metrics[kind], content, "metrics.json")
-    raw = _loaded(folder / "config.yaml")
-    config = _checked(_Config, raw, "config.yaml")
-    shapes = len(_checked(_Split, _loaded(folder / "split.json"), "split.json").train)
-    if metrics.training is None:
-        raise SdfhubError("metrics.json: says nothing about a training")
-    loader = config.data.loader
-    rows = shapes * (1 + loader.augmentation.copies)
-    drawn = metrics.training.steps * min(loader.shapes_per_step, rows) * loader.samples_per_shape
-    roles = {role: getattr(metrics, role).shapes for role in ROLES if getattr(metrics, role)}
-    found = ({}, roles) if by_distance else (roles, {})
-    return Scores(*found, metrics.training, config.trainer.max_epochs, drawn, shapes, raw)
+    metrics = _loaded(folder, "metrics.json")
+    if "known" in metrics:  # the name of the role before it was `train`
+        metrics["train"] = metrics.pop("known")
+    shapes = {}
+    for role in filter(metrics.get, ROLES):
+        content = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}")
+        rows = _checked(list[dict], content.get("shapes"), f"metrics.json: {role}.shapes")
+        kind = DistanceScore if rows and "sdf_error" in rows[0] else ShapeScore
+        shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
+    training = _checked(Training, metrics.get("training"), "metrics.json: training")
+    trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
+    return Scores(shapes, training, len(trained_on), _loaded(folder, "config.yaml"))
 
 
-def _failure(path: Path) -> str:
+def _loaded(folder: Path, name: str) -> dict[str, Any]:
+    path = folder / name
     try:
-        return str(_loaded(path)["reason"])[:500]
-    except (SdfhubError, KeyError):
-        return "for a reason that was not written down"
-
-
-def _loaded(path: Path) -> dict:
-    try:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise SdfhubError(f"{name}: is a link out of its folder")
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise SdfhubError(f"{path.name}: cannot be read ({type(error).__name__})") from error
+        raise SdfhubError(f"{name}: cannot be read ({type(error).__name__})") from error
     if not isinstance(content, dict):
-        raise SdfhubError(f"{path.name}: not what training writes")
+        raise SdfhubError(f"{name}: not what training writes")
     return content
 
 
-def _checked(model: type[BaseModel], content: dict, name: str):
+def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
-        return model.model_validate(content)
+        return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
-        raise SdfhubError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg'].lower()}") from error
+        raise SdfhubError(f"{'.'.join([name, *map(str, first['loc'])])}: {first['msg'].lower()}") from error

@@ -1,52 +1,30 @@
-"""Cells become rows: one row a method, its seeds together; one group a table's worth of settings."""
+"""Cells become rows: one row a method, its seeds together; one group for what may be compared."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
-import numpy as np
+import pandas as pd
 from scipy import stats
 
-from sdfhub.report.results import Cell
+from sdfhub.report.results import ROLES, Cell
 from sdfhub.settings import OF_THE_SEED, deciding
 
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
 """The paper's names of encodings, and ours for those that it does not name."""
 
-ORDER = ("DeepSDF", "SIREN", "FFT/SIREN", "FFT/HOSC", "HASH/SIREN", "HASH/HOSC")
-"""Rows of the paper's tables first, in its order."""
+JUDGING_GROUPS = ("sweeps", "data", "category", "scale", "fit", "evaluate")
+"""Config groups under which numbers may be compared: rows that differ in one stand in different tables."""
 
-OF_THE_GROUP = ("sweeps", "data", "category", "scale", "fit", "evaluate")
-"""Choices under which numbers may be compared: rows that differ in one stand in different tables."""
+JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
+"""Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
 
-THOUSANDFOLD = ("cd_mean", "cd_median", "excess_mean", "excess_median")
+MEASURES = ("cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy")
+COSTS = ("trained_on", "parameters", "epochs", "steps", "samples", "seconds")
 
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over seeds and the half width of its 95% confidence interval (Student's t).
-
-    Args:
-        mean: of the seeds' values.
-        half_width: None for a single seed, which says nothing about others.
-        seeds: how many.
-    """
-
-    mean: float
-    half_width: float | None
-    seeds: int
-
-
-def estimate(values: list[float]) -> Estimate:
-    """The mean of independent values with its confidence interval.
-
-    Args:
-        values: one per seed, at least one.
-    """
-    n = len(values)
-    if n < 2:
-        return Estimate(float(values[0]), None, n)
-    half = stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n)
-    return Estimate(float(np.mean(values)), float(half), n)
+NONE = "–"
+"""What tables show where there is nothing."""
 
 
 @dataclass(frozen=True)
@@ -67,53 +45,24 @@ class Row:
 
     @property
     def label(self) -> str:
-        """Method, normals where they are no matter of course, and detail, in one line."""
-        plain = self.method == "DeepSDF" and self.normals == "off"
-        words = "" if plain else {"on": " + normals", "off": ", no normals"}.get(self.normals, "")
-        return f"{self.method}{words}{f' ({self.detail})' if self.detail else ''}"
+        """Method, normals unless it is DeepSDF without them, and detail, in one line."""
+        words = {"on": " + normals", "off": ", no normals" if self.method != "DeepSDF" else ""}
+        return self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
 
     @property
     def done(self) -> list[Cell]:
+        """The finished cells."""
         return [cell for cell in self.cells if cell.scores]
 
-    def has_surfaces(self, role: str = "known") -> bool:
-        """Whether any judged shape has a surface: without one CD is a penalty, which says nothing."""
-        return any(not shape.failed for cell in self.done for shape in cell.scores.shapes.get(role, []))
+    @property
+    def first(self) -> Cell | None:
+        """The first finished cell."""
+        return next(iter(self.done), None)
 
-    def estimate(self, quantity: str, role: str = "known") -> Estimate | None:
-        """A quantity over the finished seeds; None where no seed has it.
-
-        Args:
-            quantity: `cd_mean`, `cd_median`, `excess_mean`, `excess_median` (normalised units squared, shapes
-                without a surface counted with their penalty), `normals_mean` (|cos| between normals, shapes
-                with a surface), `floor_mean`, `no_surface` (shapes), `sdf_error_mean`, `sdf_error_median`,
-                `sign_accuracy_mean` (of sources without meshes), `seconds`, `parameters`, `steps`, `epochs`,
-                `samples` or `trained_on`.
-            role: `known` or `held_out`; costs do not depend on it.
-        """
-        values = [_value(cell, quantity, role) for cell in self.done]
-        kept = [value for value in values if value is not None]
-        return estimate(kept) if kept else None
-
-
-def _value(cell: Cell, quantity: str, role: str) -> float | None:
-    scores = cell.scores
-    if quantity in ("seconds", "parameters", "steps"):
-        return getattr(scores.training, quantity)
-    if quantity in ("epochs", "samples", "trained_on"):
-        return getattr(scores, quantity)
-    by_distance = quantity.startswith(("sdf_error", "sign_accuracy"))
-    shapes = (scores.distances if by_distance else scores.shapes).get(role)
-    if not shapes:
-        return None
-    if quantity == "no_surface":
-        return sum(shape.failed for shape in shapes)
-    what, statistic = quantity.rsplit("_", 1)
-    field = {"cd": "counted_cd", "normals": "normal_consistency"}.get(what, what)
-    values = [value for shape in shapes if (value := getattr(shape, field)) is not None]
-    if not values:
-        return None
-    return float({"mean": np.mean, "median": np.median}[statistic](values))
+    @property
+    def searched(self) -> str:
+        """What search the settings come from, as the experiment's config says: `no` where it says nothing."""
+        return str(self.first.scores.config.get("searched") or "no")[:200] if self.first else NONE
 
 
 @dataclass(frozen=True)
@@ -121,163 +70,188 @@ class Group:
     """Rows that may be compared: the same sweep, shapes, scale and way of judging.
 
     Args:
-        choices: what they share of OF_THE_GROUP.
-        told: names of choices that a title tells: without one, groups of the sweep would share a title.
-        said: settings of the command line that decide which shapes are judged, and how.
-        settings: values on the command line that all of them share beside.
-        rows: in the order of the paper, then of the command.
+        judging: options of JUDGING_GROUPS, and values of JUDGING_SETTINGS on the command line.
+        rows: methods in the order of the commands, each with normals first.
     """
 
-    choices: dict[str, str]
-    told: list[str]
-    said: dict[str, str]
-    settings: dict[str, str]
+    judging: dict[str, str]
     rows: list[Row]
 
-    @cached_property
+    @property
     def title(self) -> str:
-        """`chairs, data=open, scale=cpu, trained on 20`; settings of all rows stand below a table."""
+        """`chairs, data=open, scale=cpu, fit=gauss_newton, evaluate=paper, trained on 20`."""
         return ", ".join(self.title_parts)
 
     @property
     def title_parts(self) -> list[str]:
-        """The words of the title, the category first."""
-        shapes = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
-        counted = (
-            [f"trained on {' to '.join(map(str, dict.fromkeys((shapes[0], shapes[-1]))))}"] if shapes else []
-        )
-        named = [f"{name}={self.choices[name]}" for name in self.told if name in self.choices]
-        named += [f"{key}={value}" for key, value in self.said.items()]
-        return [self.choices.get("category", "all"), *named, *counted]
+        """The words of the title: the category, or the name of the user's folder, first."""
+        subject = self.judging.get("category", "all")
+        if self.judging.get("data") == "folder" and "data.source.root" in self.judging:
+            subject = Path(self.judging["data.source.root"]).name
+        parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
+        counts = {cell.scores.trained_on for row in self.rows for cell in row.done}
+        ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
+        return [subject, *parts, f"trained on {ends}"]
 
-    def row(self, method: str, normals: str) -> Row | None:
-        """The row of that method, where there is one and no other."""
-        of_method = self.rows_of(method, normals)
-        return of_method[0] if len(of_method) == 1 else None
+    @cached_property
+    def shapes(self) -> pd.DataFrame:
+        """A line for each judged shape of each finished cell: MEASURES, distances times 10^3.
 
-    def rows_of(self, method: str, normals: str) -> list[Row]:
-        """The rows of that method; several where they differ in a setting."""
-        return [row for row in self.rows if (row.method, row.normals) == (method, normals)]
+        The `cd` of a shape without a surface is that of a single point.
+        """
+        records = [
+            vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
+            | {"role": role, "shape": shape.id} | shape.measures()
+            for row in self.rows
+            for cell in row.done
+            for role, shapes in cell.scores.shapes.items()
+            for shape in shapes
+        ]  # fmt: skip
+        places = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
+        return pd.DataFrame(records, columns=[*places, *MEASURES]).astype(dict.fromkeys(MEASURES, float))
 
-    def rival(self, row: Row) -> Row | None:
-        """The row of DeepSDF as published that a row is measured by: of equal settings, or the only one."""
-        rivals = self.rows_of("DeepSDF", "off")
-        alike = [rival for rival in rivals if rival.detail == row.detail]
-        return alike[0] if len(alike) == 1 else rivals[0] if len(rivals) == 1 else None
+    @cached_property
+    def statistics(self) -> pd.DataFrame:
+        """Means over seeds, by label and role: `cd_mean`, `excess_median`, ..., `no_surface`, `shapes`.
+
+        Beside each column `_ci95`, the half width of its 95% interval (Student's t; none for one seed), and
+        `_seeds`, how many seeds it is the mean of.
+        """
+        cells = self.shapes.groupby(["label", "role", "cell"], sort=False)
+        frame = cells[[name for name in MEASURES if name != "no_surface"]].agg(["mean", "median"])
+        frame.columns = ["_".join(names) for names in frame.columns]
+        frame["no_surface"], frame["shapes"] = cells["no_surface"].sum(), cells.size()
+        return over_seeds(frame, ["label", "role"])
+
+    @cached_property
+    def costs(self) -> pd.DataFrame:
+        """COSTS by label, over seeds as in `statistics`."""
+        records = [{"label": row.label} | cell.scores.costs() for row in self.rows for cell in row.done]
+        frame = pd.DataFrame(records, columns=["label", *COSTS]).astype(dict.fromkeys(COSTS, float))
+        return over_seeds(frame, ["label"])
+
+
+def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """The mean of each column over the lines of equal `by`, the half width of its 95% interval, its count."""
+    seeds = cells.groupby(by, sort=False)
+    count = seeds.count()
+    half_width = seeds.sem() * stats.t.ppf(0.975, count - 1)  # not a number for one seed
+    return pd.concat([seeds.mean(), half_width.add_suffix("_ci95"), count.add_suffix("_seeds")], axis=1)
+
+
+def settings_of(cell: Cell) -> dict[str, str]:
+    """Settings of a finished cell by dotted key that can change its result, but for the seed's."""
+    settings = deciding(cell.scores.config).items()
+    return {str(k): str(v)[:200] for k, v in settings if k not in (*OF_THE_SEED, "searched")}
+
+
+def differing(settings: list[dict[str, Any]]) -> dict[str, tuple[str, ...]]:
+    """The keys in which dicts differ, and their values in each.
+
+    Keys of one last name and equal values, such as interpolated ones, are joined by a comma.
+    """
+    joined: dict[tuple, list[str]] = {}
+    for key in dict.fromkeys(key for one in settings for key in one):
+        values = tuple(str(one.get(key, NONE)) for one in settings)
+        if len(set(values)) > 1:
+            joined.setdefault((key.rpartition(".")[2], values), []).append(key)
+    return {", ".join(keys): values for (_, values), keys in joined.items()}
 
 
 def group_cells(cells: list[Cell]) -> list[Group]:
     """The cells of a sweep as groups of rows."""
-    by_group: dict[tuple, list[Cell]] = {}
+    members: dict[tuple, list[Cell]] = {}
     for cell in cells:
-        choices = tuple(cell.plan.choices.get(name) for name in OF_THE_GROUP)
-        by_group.setdefault((choices, tuple(_of_the_group(cell).items())), []).append(cell)
-    of_all = [dict(zip(OF_THE_GROUP, choices, strict=True)) for choices, _ in by_group]
-    told = [
-        name
-        for name in OF_THE_GROUP
-        if name in ("data", "scale")
-        or (name != "category" and len({choices[name] for choices in of_all}) > 1)
-    ]
-    return [_group(members, told) for members in by_group.values()]
+        members.setdefault(tuple(_judging(cell).items()), []).append(cell)
+    return [Group(dict(judging), _rows(cells)) for judging, cells in members.items()]
 
 
-def _of_the_group(cell: Cell) -> dict[str, str]:
-    """Settings of the command line that decide which shapes are judged, and how."""
-    return {
-        key: value
-        for key, value in sorted(cell.plan.settings.items())
-        if key.startswith(("data.", "evaluate.", "scale.small_table")) and not key.startswith("data.loader.")
-    }
+def _judging(cell: Cell) -> dict[str, str]:
+    choices = {name: cell.plan.choices[name] for name in JUDGING_GROUPS if name in cell.plan.choices}
+    settings = {k: v for k, v in sorted(cell.plan.settings.items()) if k.startswith(JUDGING_SETTINGS)}
+    return choices | {k: v for k, v in settings.items() if not k.startswith("data.loader.")}
 
 
-def _group(cells: list[Cell], told: list[str]) -> Group:
-    said = _of_the_group(cells[0])
-    common = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
-    by_row: dict[tuple, list[Cell]] = {}
+def _rows(cells: list[Cell]) -> list[Row]:
+    shared = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
+    commands: dict[tuple, list[Cell]] = {}
     for cell in cells:
-        own = tuple(sorted(set(cell.plan.settings.items()) - common))
-        others = tuple(sorted(pair for pair in cell.plan.choices.items() if pair[0] not in OF_THE_GROUP))
-        by_row.setdefault((own, others), []).append(cell)
-    names = {key: (_method(dict(key[1])), dict(key[1]).get("normals", "?")) for key in by_row}
-    rows = [
-        Row(*names[key], ", ".join(filter(None, [own, differing])), seeds)
-        for key, members in by_row.items()
-        for own in [_detail(key, [k for k in by_row if names[k] == names[key]])]
-        for differing, seeds in _alike(members)
-    ]
-    rows.sort(key=lambda row: (rank(row.method), row.normals != "on"))
-    choices = {name: cells[0].plan.choices[name] for name in OF_THE_GROUP if name in cells[0].plan.choices}
-    return Group(choices, told, said, dict(sorted(common - set(said.items()))), rows)
+        commands.setdefault(cell.plan.identity[:2], []).append(cell)
+    rows: list[Row] = []
+    for members in commands.values():
+        plan = members[0].plan
+        namesakes = [cell.plan.choices for cell in cells if _name(cell.plan.choices) == _name(plan.choices)]
+        own = dict(pair for pair in plan.settings.items() if pair not in shared)
+        own |= {key: plan.choices.get(key, NONE) for key in differing(namesakes)}
+        parts = _by_settings(members)
+        changed = differing([settings_of(part[0]) for part in parts]) if len(parts) > 1 else {}
+        for number, part in enumerate(parts):
+            words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
+            detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
+            row = Row(*_name(plan.choices), detail, part)
+            twins = sum(row.label == other.label for other in rows)  # labels name rows: no two are equal
+            rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
+    methods = list(dict.fromkeys(row.method for row in rows))
+    return sorted(rows, key=lambda row: (methods.index(row.method), row.normals != "on"))
 
 
-def _alike(cells: list[Cell]) -> list[tuple[str, list[Cell]]]:
-    """Seeds of one command line, apart where they were trained under different settings.
-
-    Defaults change between two versions, and the command line does not tell it. What has no scores yet goes
-    with the last.
-
-    Returns:
-        The settings that tell them apart, in words, and the cells.
-    """
-    found: list[tuple[dict, list[Cell]]] = []
+def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
+    """Seeds of one command line, apart where defaults changed between them; unfinished ones with the last."""
+    parts: dict[tuple, list[Cell]] = {}
     for cell in cells:
         if cell.scores:
-            settings = {k: v for k, v in deciding(cell.scores.config).items() if k not in OF_THE_SEED}
-            members = next((members for one, members in found if one == settings), None)
-            if members is None:
-                found.append((settings, members := []))
-            members.append(cell)
-    if len(found) < 2:
-        return [("", cells)]
-    found[-1][1].extend(cell for cell in cells if not cell.scores)
-    by_values: dict[tuple, str] = {}
-    for key in sorted({key for one, _ in found for key in one}):
-        whole = [str(one.get(key, "unset")) for one, _ in found]
-        short = [_shortened(value) for value in whole]
-        values = tuple(short if len(set(short)) == len(set(whole)) else whole)
-        if len(set(values)) > 1:
-            by_values.setdefault(values, key)  # interpolated into other places it is told once
-    return [
-        (", ".join(f"{key}={values[k]}" for values, key in by_values.items()), members)
-        for k, (_, members) in enumerate(found)
-    ]
+            parts.setdefault(tuple(settings_of(cell).items()), []).append(cell)
+    found = list(parts.values()) or [[]]
+    found[-1].extend(cell for cell in cells if not cell.scores)
+    return found
 
 
-def _method(choices: dict[str, str]) -> str:
-    if choices.get("decoder") == "deepsdf" and choices.get("activation") == "relu":
-        return "DeepSDF" if choices.get("encoding") == "none" else f"{_encoding(choices)}DeepSDF"
-    return f"{_encoding(choices)}{choices.get('activation', '?').upper()}"
+def _name(choices: dict[str, str]) -> tuple[str, str]:
+    """Method and normals."""
+    encoding, activation = choices.get("encoding", "none"), choices.get("activation", "?")
+    is_deepsdf = choices.get("decoder") == "deepsdf" and activation == "relu"
+    method = PREFIXES.get(encoding, f"{encoding.upper()}/") + (
+        "DeepSDF" if is_deepsdf else activation.upper()
+    )
+    return method, choices.get("normals", "?")
 
 
-def _encoding(choices: dict[str, str]) -> str:
-    encoding = choices.get("encoding", "none")
-    return PREFIXES.get(encoding, f"{encoding.upper()}/")
-
-
-def rank(method: str) -> int:
-    """The place of a method among the paper's rows."""
-    return ORDER.index(method) if method in ORDER else len(ORDER)
-
-
-def _detail(key: tuple, namesakes: list[tuple]) -> str:
-    """Settings of the row's own, and choices only where rows of its name differ in them."""
-    own, others = key
-    common = set.intersection(*(set(k[1]) for k in namesakes))
-    told = dict.fromkeys([*own, *(pair for pair in others if pair not in common)])
-    return ", ".join(f"{name}={_shortened(value)}" for name, value in told)
-
-
-def _shortened(value: str) -> str:
-    """A number of more than six characters to three digits: a search draws them with sixteen."""
+def _short(value: str) -> str:
+    """A number of more than six characters to five digits: a search draws them with sixteen."""
     try:
-        return f"{float(value):.3g}" if len(value) > 6 else value
+        return f"{float(value):.5g}" if len(value) > 6 else value
     except ValueError:
         return value
 
 
-def duration(seconds: float) -> str:
-    """`4.8 s`, `48 s`, `12.5 min`, `30.2 h`."""
-    if seconds < 120:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+def table_csv(groups: list[Group]) -> str:
+    """Every row of every group as numbers: a line a role, `Group.statistics` and `Group.costs` in it."""
+    frames = [pd.DataFrame({"label": []})]
+    for group in groups:
+        rows = [
+            _place(group) | vars(row) | {"label": row.label, "searched": row.searched} for row in group.rows
+        ]
+        rows = [row | {"cells": len(row["cells"]), "role": role} for row in rows for role in ROLES]
+        numbers = (
+            pd.DataFrame(rows).join(group.statistics, on=["label", "role"]).join(group.costs, on="label")
+        )
+        frames.append(numbers)
+    return pd.concat(frames[1:] or frames).to_csv(index=False, float_format="%.9g")
+
+
+def shapes_csv(groups: list[Group]) -> str:
+    """Every judged shape of every cell as numbers: a line a seed, role and shape; distances times 10^3.
+
+    No `cd` where there is no surface, whose excess counts the CD of a single point.
+    """
+    frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
+    frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
+    return frame.assign(cd=frame["cd"].where(frame["no_surface"] != 1)).to_csv(
+        index=False, float_format="%.9g"
+    )
+
+
+def _place(group: Group) -> dict[str, str]:
+    """What tells a group from others, by column of a CSV file."""
+    settings = [f"{key}={value}" for key, value in group.judging.items() if key not in JUDGING_GROUPS]
+    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {"settings": ";".join(settings)}

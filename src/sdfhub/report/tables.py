@@ -1,20 +1,42 @@
-"""Groups of rows as tables of text: scores, the paper's figures beside them, costs, claims."""
+"""Groups of rows as tables of text, and these as Markdown and LaTeX, in which every string stays text."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import html
+import re
+from collections import Counter
+from dataclasses import dataclass, field
 
-from sdfhub.report.claims import verdicts
-from sdfhub.report.paper import COSTS, PRINTED
-from sdfhub.report.results import ROLES
-from sdfhub.report.rows import Estimate, Group, Row, duration, rank
+import pandas as pd
 
-NONE = "–"
-"""An empty cell of a table."""
+from sdfhub.report.results import ROLES, Cell
+from sdfhub.report.rows import NONE, Group, Row, differing, settings_of
 
-QUANTITIES = ("cd_mean", "cd_median", "floor_mean", "excess_mean", "excess_median")
-"""Columns of a table of scores."""
+TITLES = {"train": "Training shapes", "held_out": "Held-out shapes"}
 
-TITLES = {"known": "Known shapes", "held_out": "Held-out shapes"}
+SURFACES = {"CD mean": "cd_mean", "CD median": "cd_median", "floor": "floor_mean"}
+SURFACES |= {"excess mean": "excess_mean", "excess median": "excess_median"}
+SURFACES |= {"normals": "normal_consistency_mean", "no surface": "no_surface"}
+DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_median"}
+DISTANCES |= {"signs right": "sign_accuracy_mean"}
+"""Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
+
+LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
+
+ABOUT_CD = (
+    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
+    "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
+    "between those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: "
+    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the "
+    "lowest, however near others are."
+)
+ABOUT_DISTANCES = (
+    "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
+    "samples near its surface, then over shapes; signs right: share of samples."
+)
+ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
+ABOUT_COSTS = (
+    "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+)
+ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
 
 
 @dataclass(frozen=True)
@@ -23,30 +45,24 @@ class Table:
 
     Args:
         title: what it shows.
-        head: a heading per column; the first column names the row.
-        rows: a text per column.
-        notes: lines below it.
+        frame: of strings; the first column names the row.
+        note: below it.
         best: row and column of the cells that are the best of their column.
+        prose: whether its cells are words, to be set flush left.
     """
 
     title: str
-    head: list[str]
-    rows: list[list[str]]
-    notes: list[str]
-    best: frozenset[tuple[int, int]] = frozenset()
+    frame: pd.DataFrame
+    note: str = ""
+    best: set[tuple[int, int]] = field(default_factory=set)
+    prose: bool = False
 
 
 def tables(group: Group) -> list[Table]:
-    """The tables of a group: scores by role, known ones beside the paper, costs, and what is missing."""
-    roles = _judged_by(group, "cd_mean")
-    found = [_scores(group, role) for role in roles]
-    beside = [_beside_paper(group)] if "known" in roles and not all(row.detail for row in group.rows) else []
-    distances = [
-        _distances(group, role)
-        for role in ROLES
-        if any(r.estimate("sdf_error_mean", role) for r in group.rows)
-    ]
-    return [*found[:1], *beside, *found[1:], *distances, _costs(group), *_missing(group)]
+    """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
+    kinds = [("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES)]
+    found = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
+    return [table for table in (*found, _settings(group), _costs(group), _absent(group)) if table]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -54,190 +70,158 @@ def overview(groups: list[Group]) -> list[Table]:
     if len(groups) < 2:
         return []
     common = set.intersection(*(set(group.title_parts) for group in groups))
-    names = [
-        ", ".join(part for k, part in enumerate(group.title_parts) if k == 0 or part not in common)
-        for group in groups
-    ]
-    by_label = [{row.label: row for row in group.rows} for group in groups]
-    labels = sorted(dict.fromkeys(label for rows in by_label for label in rows), key=_place(groups))
+    labels = dict.fromkeys(row.label for group in groups for row in group.rows)
     found = []
     for role in ROLES:
-        rows = [[label, *(_excess(rows.get(label), role) for rows in by_label)] for label in labels]
-        if any(cell != NONE for row in rows for cell in row[1:]):
-            title = f"{TITLES[role]}, excess mean and median: all tables"
-            found.append(Table(title, ["method", *names], rows, [_OVERVIEW_NOTE]))
+        columns = [pd.Series(list(labels), name="method")]
+        for group in groups:
+            parts = [part for k, part in enumerate(group.title_parts) if k == 0 or part not in common]
+            lines = _lines(group, role).reindex(labels)
+            seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
+            texts = zip(
+                _texts(lines, "excess_mean", False), _texts(lines, "excess_median", False), seeds, strict=True
+            )
+            texts = [NONE if mean == NONE else f"{mean}, {median}{n}" for mean, median, n in texts]
+            columns.append(pd.Series(texts, name=", ".join(parts)))
+        table = Table(f"{TITLES[role]}, excess", pd.concat(columns, axis=1), ABOUT_OVERVIEW)
+        found += [table] if (table.frame.iloc[:, 1:] != NONE).any(axis=None) else []
     return found
 
 
-_OVERVIEW_NOTE = (
-    "Excess CD over the noise floor times 10³, mean and median over shapes; in brackets the seeds that they "
-    "are means of, where these are several: the tables below have their intervals."
-)
+def origin(commands: list[str], cells: list[Cell]) -> Table:
+    """How a sweep was made: its commands, how long it trained, versions and hardware."""
+    trainings = [cell.scores.training for cell in cells if cell.scores]
+    spent = duration(sum(training.seconds for training in trainings))
+    made_with = Counter(", ".join(f"{k} {v}" for k, v in one.made_with.items()) for one in trainings)
+    lines = [["command", command] for command in commands]
+    lines.append(["trainings", f"{len(trainings)} of {len(cells)} done, {spent} in all"])
+    lines += [[f"{count} of them with", words or "not written down"] for words, count in made_with.items()]
+    return Table("How it was made", pd.DataFrame(lines, columns=["what", "which"]), prose=True)
 
 
-def _place(groups: list[Group]) -> Callable[[str], tuple[int, int]]:
-    """Sorts labels as the paper's rows, then as the groups have them."""
-    places = {row.label: (k, row) for group in groups for k, row in enumerate(group.rows)}
-    return lambda label: (rank(places[label][1].method), places[label][0])
+def _lines(group: Group, role: str) -> pd.DataFrame:
+    """The statistics of a role, a line for each row; not a number where a row has none."""
+    lines = group.statistics[group.statistics.index.get_level_values("role") == role].droplevel("role")
+    return lines.reindex([row.label for row in group.rows])
 
 
-def _excess(row: Row | None, role: str) -> str:
-    values = [row.estimate(f"excess_{one}", role) for one in ("mean", "median")] if row else []
-    told = [_told(v, 4 if abs(v.mean) < 0.01 else 2, 1e3).partition(" ")[0] for v in values if v]
-    several = f" ({values[0].seeds})" if told and values[0].seeds > 1 else ""
-    return f"{', '.join(told)}{several}" if told else NONE
+def _scores(group: Group, role: str, title: str, quantities: dict[str, str], about: str) -> Table | None:
+    lines = _lines(group, role)
+    if lines[next(iter(quantities.values()))].isna().all():
+        return None
+    columns = {name: _texts(lines, quantity) for name, quantity in quantities.items()}
+    if "no surface" in columns:
+        counts = lines[["no_surface", "shapes"]].mul(lines["shapes_seeds"], axis=0).to_numpy().tolist()
+        columns["no surface"] = [NONE if pd.isna(lost) else f"{lost:.0f}/{of:.0f}" for lost, of in counts]
+    lines = lines.reset_index(drop=True)
+    rivals = lines[lines["no_surface"] < lines["shapes"]]  # without any surface CD is a penalty
+    best = {
+        (int(row), column)
+        for column, quantity in enumerate(quantities.values(), start=1)
+        if len(lines) > 1 and quantity in LOWER_IS_BETTER
+        for row in rivals.index[rivals[quantity] == rivals[quantity].min()]
+    }
+    return Table(TITLES[role] + title, _frame(group, columns), about, best)
 
 
-def _judged_by(group: Group, quantity: str) -> list[str]:
-    return [role for role in ROLES if any(row.estimate(quantity, role) for row in group.rows)]
-
-
-def _scores(group: Group, role: str) -> Table:
-    head = ["method", "CD mean", "CD median", "floor", "excess mean", "excess median"]
-    head += ["normals", "no surface", "seeds"]
-    rivals = [f"excess {one} / DeepSDF" for one in ("mean", "median") if group.rows_of("DeepSDF", "off")]
-    rows = []
-    for row in group.rows:
-        cells = [_thousandth(row.estimate(quantity, role)) for quantity in QUANTITIES]
-        cells += [_told(row.estimate("normals_mean", role), 3), _no_surface(row, role), _seeds(row)]
-        cells += [_ratio(group, row, q, role) for q in ("excess_mean", "excess_median") if rivals]
-        rows.append([row.label, *cells])
-    notes = [
-        "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two "
-        "samplings of the truth. Shapes without a surface count with the CD of a single point. Normals: mean "
-        "|cos| between those of the reconstruction and of the truth, of shapes with a surface. The floor "
-        "is a mean over shapes: that of a single one, and so a median CD, may lie below it. "
-        "± is a 95% confidence interval over seeds (Student's t); bold: the lowest, however near others are."
-    ]
-    if group.settings:
-        notes.append(f"All rows with {', '.join(f'{key}={value}' for key, value in group.settings.items())}.")
-    title = f"{TITLES[role]}: {group.title}"
-    return Table(title, [*head, *rivals], rows, notes, _best(group, role))
-
-
-def _distances(group: Group, role: str) -> Table:
-    """Scores of a source without meshes, such as DeepSDF's npz files."""
-    head = ["method", "|f - d| mean", "|f - d| median", "signs right", "seeds", "mean / DeepSDF"]
-    rows = []
-    for row in group.rows:
-        errors = [_thousandth(row.estimate(f"sdf_error_{one}", role)) for one in ("mean", "median")]
-        signs = _told(row.estimate("sign_accuracy_mean", role), 4)
-        rows.append([row.label, *errors, signs, _seeds(row), _ratio(group, row, "sdf_error_mean", role)])
-    note = (
-        "The source holds no meshes, so that no Chamfer distance can be had. |f - d| times 10³: mean over a "
-        "shape's samples near its surface, then over shapes; signs right: share of samples."
+def _settings(group: Group) -> Table | None:
+    rows = [row for row in group.rows if row.done]
+    lines = sorted(
+        (key, *values) for key, values in differing([settings_of(row.done[0]) for row in rows]).items()
     )
-    return Table(f"{TITLES[role]}, signed distances: {group.title}", head, rows, [note])
-
-
-def _beside_paper(group: Group) -> Table:
-    """CD of known shapes and its ratio to DeepSDF's, ours and what the paper prints."""
-    is_large = group.choices.get("sweeps") == "table_large"
-    printed = PRINTED["table_large" if is_large else "table_small"]
-    rows = []
-    for row in group.rows:
-        cells = []
-        for quantity in ("cd_mean", "cd_median"):
-            figures = {} if row.detail else printed.get((row.method, row.normals), {})
-            value, rival = figures.get(quantity), printed["DeepSDF", "off"][quantity]
-            cells += [_thousandth(row.estimate(quantity)), f"{value * 1e3:.4f}" if value else NONE]
-            cells += [_ratio(group, row, quantity), f"{value / rival:.3g}" if value else NONE]
-        rows.append([row.label, *cells])
-    head = [
-        f"CD {statistic}{end}"
-        for statistic in ("mean", "median")
-        for end in ("", ", paper", " / DeepSDF", " / DeepSDF, paper")
-    ]
-    notes = [f"The paper's columns are its Table {3 if is_large else 2}, from other data: compare ratios."]
-    return Table(f"Beside the paper: {group.title}", ["method", *head], rows, notes)
-
-
-def _ratio(group: Group, row: Row, quantity: str, role: str = "known") -> str:
-    """The row's value over DeepSDF's; none where that says nothing (an excess at or below 0)."""
-    measured_by = group.rival(row)
-    rival = measured_by.estimate(quantity, role) if measured_by else None
-    own = row.estimate(quantity, role)
-    return f"{own.mean / rival.mean:.3g}" if own and rival and min(own.mean, rival.mean) > 0 else NONE
-
-
-def _best(group: Group, role: str) -> frozenset[tuple[int, int]]:
-    """Row and column of the lowest value of each quantity but the floor, which is no row's merit."""
-    found = set()
-    for column, quantity in enumerate(QUANTITIES, start=1):
-        rows = [(k, row) for k, row in enumerate(group.rows) if row.has_surfaces(role)]
-        values = {k: row.estimate(quantity, role).mean for k, row in rows}
-        if len(group.rows) > 1 and values and quantity != "floor_mean":
-            best = min(values.values())
-            found |= {(k, column) for k, value in values.items() if value == best}
-    return frozenset(found)
+    frame = pd.DataFrame(lines, columns=["setting", *(row.label for row in rows)])
+    return Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True) if lines else None
 
 
 def _costs(group: Group) -> Table:
-    head = ["method", "shapes", "parameters", "epochs", "steps", "samples", "training time"]
-    head += ["time / DeepSDF", "paper: parameters", "paper: training time", "paper: time / DeepSDF"]
-    rows = []
-    for row in group.rows:
-        counts = [
-            _count(row.estimate(key)) for key in ("trained_on", "parameters", "epochs", "steps", "samples")
-        ]
-        seconds = row.estimate("seconds")
-        paper = COSTS.get((row.method, row.normals)) if not row.detail else None
-        printed = [NONE] * 3
-        if paper:
-            share = paper["seconds"] / COSTS["DeepSDF", "off"]["seconds"]
-            printed = [f"{paper['parameters']:,.0f}", f"{paper['seconds'] / 3600:.0f} h", f"{share:.3g}"]
-        time = NONE if seconds is None else duration(seconds.mean)
-        time += f" ± {duration(seconds.half_width)}" if seconds and seconds.half_width else ""
-        rows.append([row.label, *counts, time, _ratio(group, row, "seconds"), *printed])
-    notes = [
-        "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+    lines = group.costs.reindex([row.label for row in group.rows])
+    names = {"shapes": "trained_on"} | {name: name for name in ("parameters", "epochs", "steps", "samples")}
+    columns = {k: [NONE if pd.isna(n) else f"{n:,.0f}" for n in lines[name]] for k, name in names.items()}
+    times = zip(lines["seconds"], lines["seconds_ci95"], strict=True)
+    columns["training time"] = [
+        NONE if pd.isna(mean) else duration(mean) + (f" ± {duration(half)}" if half > 0 else "")
+        for mean, half in times
     ]
-    return Table(f"Cost: {group.title}", head, rows, notes)
+    return Table("Cost", _frame(group, columns), ABOUT_COSTS)
 
 
-def _missing(group: Group) -> list[Table]:
-    """The cells without scores, each with its reason; no table where there are none."""
-    lines = [
-        [f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason]
-        for row in group.rows
-        for cell in row.cells
-        if cell.state != "done"
-    ]
-    return [Table(f"Not there: {group.title}", ["cell", "state", "reason"], lines, [])] if lines else []
+def _absent(group: Group) -> Table | None:
+    cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
+    lines = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
+    frame = pd.DataFrame(lines, columns=["cell", "state", "reason"])
+    return Table("Not there", frame, prose=True) if lines else None
 
 
-def claims_table(group: Group) -> Table:
-    """Every claim of the paper with its verdict and the figures behind it."""
-    rows = [
-        [one.claim.text, one.claim.source, one.told, "; ".join([*one.figures, one.claim.note]).strip("; ")]
-        for one in verdicts(group)
-    ]
-    return Table(f"Claims of the paper: {group.title}", ["claim", "source", "verdict", "figures"], rows, [])
-
-
-def _thousandth(value: Estimate | None) -> str:
-    """A Chamfer distance times 10^3, four digits below 10 and fewer above, with its interval."""
-    return _told(value, 4 if value and abs(value.mean) < 0.01 else 2, 1e3)
-
-
-def _told(value: Estimate | None, places: int, factor: float = 1.0) -> str:
-    if value is None:
-        return NONE
-    half = f" ± {value.half_width * factor:.{places}f}" if value.half_width else ""
-    return f"{value.mean * factor:.{places}f}{half}"
-
-
-def _count(value: Estimate | None) -> str:
-    return NONE if value is None else f"{value.mean:,.0f}"
-
-
-def _no_surface(row: Row, role: str) -> str:
-    shapes = [cell.scores.shapes.get(role, []) for cell in row.done]
-    return f"{sum(s.failed for one in shapes for s in one)}/{sum(map(len, shapes))}" if row.done else NONE
+def _frame(group: Group, columns: dict[str, list[str]]) -> pd.DataFrame:
+    """Columns between the labels of the rows and what the rows rest on: seeds, and a search or none."""
+    columns = {"method": [row.label for row in group.rows]} | columns
+    columns |= {"seeds": list(map(_seeds, group.rows)), "searched": [row.searched for row in group.rows]}
+    return pd.DataFrame(columns)
 
 
 def _seeds(row: Row) -> str:
-    states = {cell.state for cell in row.cells}
-    if not row.done:
-        return "failed" if "failed" in states else "missing"
-    return f"{len(row.done)}/{len(row.cells)}"
+    failed = any(cell.state == "failed" for cell in row.cells)
+    return f"{len(row.done)}/{len(row.cells)}" if row.done else "failed" if failed else "missing"
+
+
+def _texts(lines: pd.DataFrame, quantity: str, interval: bool = True) -> list[str]:
+    """A column as text with its intervals, four places below 10 and two above."""
+    texts = []
+    for mean, half in zip(lines[quantity], lines[f"{quantity}_ci95"], strict=True):
+        places = 4 if abs(mean) < 10 else 2
+        spread = f" ± {half:.{places}f}" if interval and half >= 0.5 * 10**-places else ""
+        texts.append(NONE if pd.isna(mean) else f"{mean:.{places}f}{spread}")
+    return texts
+
+
+def duration(seconds: float) -> str:
+    """`4.8 s`, `48 s`, `12.5 min`, `30.2 h`."""
+    if seconds < 120:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def markdown(title: str, tables: list[Table]) -> str:
+    """Tables below a heading as GitHub's Markdown."""
+    parts = [f"## {_markdown_text(title)}\n"]
+    for table in tables:
+        frame = _escaped(table, _markdown_text, "**{}**")
+        grid = frame.to_markdown(index=False, tablefmt="github", disable_numparse=True)
+        note = f"\n{_markdown_text(table.note)}\n" if table.note else ""
+        parts.append(f"### {_markdown_text(table.title)}\n\n{grid}\n{note}")
+    return "\n".join(parts)
+
+
+def _escaped(table: Table, escape, bold: str) -> pd.DataFrame:
+    frame = table.frame.map(escape).set_axis(list(map(escape, table.frame.columns)), axis=1)
+    for row, column in table.best:
+        frame.iat[row, column] = bold.format(frame.iat[row, column])
+    return frame
+
+
+def _markdown_text(text: str) -> str:
+    return " ".join(re.sub(r"([\\|*_`\[\]])", r"\\\1", html.escape(str(text), quote=False)).split())
+
+
+LATEX = {"±": r"$\pm$", "–": "--", "³": r"\textsuperscript{3}", "\\": r"\textbackslash{}"}
+LATEX |= {"^": r"\textasciicircum{}", "~": r"\textasciitilde{}"} | {c: f"\\{c}" for c in "&%$#_{}"}
+
+
+def _latex_text(text: str) -> str:
+    """Text that LaTeX prints as it is; question marks for characters that its fonts may lack."""
+    return "".join(LATEX.get(c, c if c.isascii() and c.isprintable() else "?") for c in str(text))
+
+
+def latex(sections: list[tuple[str, list[Table]]]) -> str:
+    """A document of titled tables that compiles; each table can be copied out (booktabs)."""
+    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs,graphicx}"]
+    lines += [r"\usepackage[landscape,margin=1.5cm]{geometry}", r"\begin{document}"]
+    for title, tables in sections:
+        for table in tables:
+            frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
+            form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
+            lines += [r"\begin{table}[p]\centering", rf"\caption{{{_latex_text(f'{table.title}: {title}')}}}"]
+            lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
+            lines += [frame.to_latex(index=False, escape=False, column_format=form) + "}"]
+            lines += [rf"\par\smallskip\footnotesize {_latex_text(table.note)}", r"\end{table}"]
+    return "\n".join([*lines, r"\end{document}", ""])

@@ -41,6 +41,7 @@ class Evidence:
 
     Args:
         rows: N, bounded points of an observation, >= 4.
+        samples: the same of signed samples, >= 4: as many as `evaluate` fits.
         surface: share of them on the surface, in [0, 1].
         uniform: share of them anywhere in the cube, or in the space a sensor saw to be empty, in [0, 1].
         variances: squared standard deviations of the jitter of the others, normalised units squared.
@@ -50,36 +51,32 @@ class Evidence:
         quiet: noise below this is none, normalised frame: a smooth surface's curvature looks like it.
     """
 
-    rows: int
-    surface: float
-    uniform: float
-    variances: tuple[float, ...]
-    cells: int
-    certain: float
-    background: bool
-    quiet: float
+    rows: int = 8192
+    samples: int = 16384
+    surface: float = 0.25
+    uniform: float = 0.15
+    variances: tuple[float, ...] = (0.005, 0.0005)
+    cells: int = 64
+    certain: float = 0.2
+    background: bool = False
+    quiet: float = 0.003
 
     def __post_init__(self):
         object.__setattr__(self, "variances", tuple(self.variances))  # YAML gives a list
-        if self.rows < 4 or self.cells < 8 or not 0 <= self.certain < 0.5:
-            raise ValueError("rows must be at least 4, cells at least 8, certain in [0, 0.5)")
+        if min(self.rows, self.samples) < 4 or self.cells < 8 or not 0 <= self.certain < 0.5:
+            raise ValueError("rows and samples must be at least 4, cells at least 8, certain in [0, 0.5)")
         if min(self.surface, self.uniform) < 0 or self.surface + self.uniform > 1:
             raise ValueError("surface and uniform must be shares that leave room for each other")
         if not self.variances or min(self.variances) <= 0 or self.quiet < 0:
             raise ValueError("variances must be positive numbers, quiet not negative")
 
     def of_samples(self, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> Observation:
-        """From points [N, 3] and their signed distances [N], on both sides: half of the rows inside."""
-        sides = [np.flatnonzero(sdf >= 0), np.flatnonzero(sdf < 0)]
-        counts = self.rows - self.rows // 2, self.rows // 2
-        rows = np.concatenate(
-            [
-                rng.permutation(np.resize(rng.permutation(side), count))
-                for side, count in zip(sides, counts, strict=True)
-            ]
-        )
-        signed = np.zeros(len(rows), bool)
-        return self._shuffled((points[rows], sdf[rows], sdf[rows], signed), 0.0, rng)
+        """From points [N, 3] and their signed distances [N], on both sides: half of the samples inside."""
+        half = self.samples // 2
+        sides = (np.flatnonzero(sdf >= 0), self.samples - half), (np.flatnonzero(sdf < 0), half)
+        rows = np.concatenate([np.resize(rng.permutation(side), count) for side, count in sides])
+        rows = rng.permutation(rows)
+        return Observation.of_samples(points[rows], sdf[rows])
 
     def of_cloud(
         self, points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
@@ -164,8 +161,8 @@ class Evidence:
 
     def _noise_in(self, points: np.ndarray) -> float:
         """The noise of points [M, 3], normalised frame, or 0 where there is hardly any."""
-        found = noise_of(points)
-        return found if found > self.quiet else 0.0
+        noise = noise_of(points)
+        return noise if noise > self.quiet else 0.0
 
     def _uniform(self) -> int:
         return min(round(self.uniform * self.rows), self.rows - round(self.surface * self.rows))
@@ -178,13 +175,10 @@ class Evidence:
     def _with_surface(
         self, points: np.ndarray, bounds: Bounds, noise: float, rng: np.random.Generator
     ) -> Observation:
-        """The bounded places, and for the rest of the rows surface points, whose distance is 0."""
-        chosen = points[np.resize(rng.permutation(len(points)), self.rows - len(bounds[0]))]
-        none = np.zeros(len(chosen))
-        joined = (np.concatenate(pair) for pair in zip(bounds, (chosen, none, none, none > 0), strict=True))
-        return self._shuffled(tuple(joined), noise, rng)
-
-    def _shuffled(self, bounds: Bounds, noise: float, rng: np.random.Generator) -> Observation:
+        """The bounded places, and for the rest of the rows surface points, whose distance is 0; shuffled."""
+        surface = points[np.resize(rng.permutation(len(points)), self.rows - len(bounds[0]))]
+        zero = np.zeros(len(surface))
         order = rng.permutation(self.rows)
-        points, low, high = (part[order].astype(np.float32) for part in bounds[:3])
-        return Observation(points, low, high, bounds[3][order], float(noise))
+        pairs = zip(bounds, (surface, zero, zero, zero > 0), strict=True)
+        points, low, high, unsigned = (np.concatenate(pair)[order] for pair in pairs)
+        return Observation(*(part.astype(np.float32) for part in (points, low, high)), unsigned, float(noise))

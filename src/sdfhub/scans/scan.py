@@ -12,6 +12,7 @@ from sdfhub.data.sources.deepsdf import npz_array, read_samples
 from sdfhub.data.sources.mesh_files import FORMATS as MESHES
 from sdfhub.data.sources.mesh_files import MAX_BYTES, check_length, read_mesh
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.shapes import Frame
 
 FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
 LEAST = 50
@@ -31,8 +32,7 @@ class Scan:
         faces: [F, 3] int64 rows of `points`, of a mesh; else None.
         sdf: [N] float64 of signed samples, negative inside, normalised frame; else None.
         sensor: [3] float64, the place from which all points were seen; None where not known.
-        center: [3] float64 and scale of signed samples: `source = normalised / scale + center`.
-        scale: as above.
+        frame: of signed samples: where the normalised frame lies in their source's; None where not known.
     """
 
     points: np.ndarray
@@ -40,48 +40,34 @@ class Scan:
     faces: np.ndarray | None = None
     sdf: np.ndarray | None = None
     sensor: np.ndarray | None = None
-    center: np.ndarray | None = None
-    scale: float = 1.0
+    frame: Frame | None = None
 
     def __post_init__(self):
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype.kind != "f":
             raise ValueError(f"points must be [N, 3] numbers, they are {list(self.points.shape)}")
         if len(self.points) < LEAST and self.faces is None:
             raise ValueError(f"holds {len(self.points)} points; at least {LEAST} are needed to know a shape")
-        for name, shape in (
-            ("normals", self.points.shape),
-            ("sdf", self.points.shape[:1]),
-            ("sensor", (3,)),
-            ("center", (3,)),
-        ):
+        count = len(self.points)
+        shapes = {"points": (count, 3), "normals": (count, 3), "sdf": (count,), "sensor": (3,)}
+        for name, shape in shapes.items():
             part = getattr(self, name)
             if part is not None and part.shape != shape:
                 raise ValueError(f"{name} must be {list(shape)} numbers, they are {list(part.shape)}")
-        for name in ("points", "normals", "sdf", "sensor", "center"):
-            part = getattr(self, name)
-            bad = 0 if part is None else int((~np.isfinite(part)).sum())
-            if bad:
+            if part is not None and (bad := int((~np.isfinite(part)).sum())):
                 raise ValueError(f"{bad} numbers of its {name} are not finite; remove those points")
         if self.normals is not None:
             lengths = np.linalg.norm(self.normals, axis=1, keepdims=True)
             if not (lengths > 0).all():
                 raise ValueError("some of its normals are zero; remove them, or all normals")
             object.__setattr__(self, "normals", self.normals / lengths)
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale must be a positive number, it is {self.scale}")
         if self.sdf is not None and not (self.sdf.min() < 0 <= self.sdf.max()):
             raise ValueError("its signed distances are all on one side; both sides are needed")
 
     @property
     def kind(self) -> str:
         """What it is: mesh, samples, view, oriented or bare."""
-        if self.faces is not None:
-            return "mesh"
-        if self.sdf is not None:
-            return "samples"
-        if self.sensor is not None:
-            return "view"
-        return "bare" if self.normals is None else "oriented"
+        kinds = {"mesh": self.faces, "samples": self.sdf, "view": self.sensor, "oriented": self.normals}
+        return next((kind for kind, part in kinds.items() if part is not None), "bare")
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -175,20 +161,16 @@ def _archive(path: Path) -> Scan:
         raise SdfhubError(f"{path}: cannot be read as npz; it may be cut off or damaged") from error
     if {"pos", "neg"} <= names:
         samples = read_samples(path)
-        return _samples(samples.points, samples.sdf, samples.center, samples.scale)
+        points, sdf = samples.points.astype(np.float64), samples.sdf.astype(np.float64)
+        return Scan(points, sdf=sdf, frame=Frame(samples.center, samples.scale))
     if "points" not in names:
-        found = ", ".join(sorted(names)) or "nothing"
-        raise SdfhubError(f"{path}: holds {found}; expected pos and neg, points and sdf, or points")
+        what = ", ".join(sorted(names)) or "nothing"
+        raise SdfhubError(f"{path}: holds {what}; expected pos and neg, points and sdf, or points")
     parts = {name: npz_array(path, name).astype(np.float64) for name in names & _PARTS}
-    if "sdf" in parts:
-        center, scale = parts.get("center", np.zeros(3)), parts.get("scale", np.ones(1))
-        return _samples(parts["points"], parts["sdf"], center, float(scale.ravel()[0]))
-    return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))
-
-
-def _samples(points: np.ndarray, sdf: np.ndarray, center: np.ndarray, scale: float) -> Scan:
-    points, sdf = points.astype(np.float64), sdf.astype(np.float64)
-    return Scan(points, sdf=sdf, center=center, scale=scale)
+    if "sdf" not in parts:
+        return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))
+    center, scale = parts.get("center", np.zeros(3)), parts.get("scale", np.ones(1))
+    return Scan(parts["points"], sdf=parts["sdf"], frame=Frame(center, float(scale.ravel()[0])))
 
 
 _PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}

@@ -9,26 +9,25 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch.export import Dim
 from tqdm import tqdm
 
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import FORMATS, write_mesh
 from sdfhub.model.decoder import Decoder
+from sdfhub.opening import beside, load, write_space
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import beside, load, write_space
 from sdfhub.whole_file import write_whole
 
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
 """What a space is exported as in one file, and the file's name by default."""
 
 
-def export(config: dict[str, Any]) -> None:
+def export(config: DictConfig) -> None:
     """The task: `config` as conf/export.yaml has it."""
-    run, to = check(config["run"], str, "run"), check(config["to"], str, "to")
-    folder = beside(run, check(config["out"], str | None, "out"), "export")
+    to, folder = str(config.to), beside(config.run, config.out, "export")
     if to == "meshes":
         export_meshes(config, folder)
         return
@@ -37,7 +36,7 @@ def export(config: dict[str, Any]) -> None:
     if kind is None:
         choices = ", ".join([*FILES, "meshes"])
         raise SdfhubError(f"to={to}: choose {choices}, or a .safetensors, .onnx or .pt2 file")
-    space = load(run, device="cpu")
+    space = load(config.run, device="cpu", trust=config.trust or ())
     if kind != "safetensors":
         write_whole(path, function_file(as_function(space.decoder), kind))
         print(f"function:  {path}: points [B, N, 3] and codes [B, L] to sdf [B, N]")
@@ -46,18 +45,17 @@ def export(config: dict[str, Any]) -> None:
     print(f"space:     {path}: sdfhub.load({str(path)!r})")
 
 
-def export_meshes(config: dict[str, Any], folder: Path) -> None:
+def export_meshes(config: DictConfig, folder: Path) -> None:
     """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
-    suffix = check(config["format"], Literal[FORMATS], "format")
-    chosen = check(config["shapes"], list[str | int] | str | int | None, "shapes")
+    suffix = check(config.format, Literal[FORMATS], "format")
+    chosen = OmegaConf.to_container(config)["shapes"]
     chosen = [chosen] if isinstance(chosen, str | int) else chosen
-    resolution = check(config["resolution"], int, "resolution")
-    space = load(check(config["run"], str, "run"))
+    space = load(config.run, trust=config.trust or ())
     rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]
     if not rows:
         raise SdfhubError("shapes=[]: name at least one, or null for all")
     empty = []
-    meshes = tqdm(space.meshes(list(rows), resolution), total=len(rows), unit="shape", disable=None)
+    meshes = tqdm(space.meshes(list(rows), config.resolution), total=len(rows), unit="shape", disable=None)
     for row, (vertices, faces) in zip(rows, meshes, strict=True):
         write_mesh(vertices, faces, folder / "meshes" / f"{space.ids[row]}.{suffix}")
         empty += [] if len(faces) else [space.ids[row]]
@@ -120,9 +118,5 @@ def _quiet() -> Iterator[None]:
 
 
 def main() -> None:
-    """Console entry: `sdfhub export run=RUN to=safetensors`."""
-
-    def task(config: DictConfig) -> None:
-        export(plain(config))
-
-    run_task(task, "export")
+    """Console entry: `sdfhub export RUN TO`."""
+    run_task(export, "export", ["run", "to"])

@@ -9,6 +9,7 @@ Source: github.com/facebookresearch/DeepSDF: networks/deep_sdf_decoder.py, deep_
 """
 
 import json
+import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,14 +21,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, write_checkpoint
+from sdfhub.composition import plain
 from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shape_id
 from sdfhub.data.sources.split_file import names_listed
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
+from sdfhub.model.saved import saved_decoder
+from sdfhub.opening import begin_run, load
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import first_word_as, run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import load, trained_decoder
-from sdfhub.tasks.run import begin_run
+from sdfhub.tasks.app import run_task
+
+log = logging.getLogger(__name__)
 
 OWN_KEYS = ("folder", "epoch", "split", "out")
 """Keys of the task's config that are no part of a training's."""
@@ -61,11 +65,12 @@ class Specs(BaseModel):
     CodeRegularizationLambda: float = 1e-4
 
 
-def import_deepsdf(config: dict[str, Any]) -> Path:
+def import_deepsdf(composed: DictConfig) -> Path:
     """The task: `config` as conf/import_deepsdf.yaml has it. Returns the run's folder."""
+    config = plain(composed)
     folder, epoch = Path(check(config["folder"], str, "folder")), check(config["epoch"], str | int, "epoch")
     out, split = (check(config[key], str | None, key) for key in ("out", "split"))
-    run = Path(out) if out else Path(config["output_root"]) / "deepsdf" / folder.resolve().name
+    run = Path(out) if out else Path(config["paths"]["output"]) / "deepsdf" / folder.resolve().name
     if (run / "config.yaml").exists():
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
     specs = read_specs(folder / "specs.json")
@@ -73,7 +78,7 @@ def import_deepsdf(config: dict[str, Any]) -> Path:
     parameters = folder / "ModelParameters" / f"{epoch}.pth"
     node = decoder_node(specs, folder / "specs.json")
     weights = decoder_weights(_read(parameters, "model_state_dict"), specs, node, parameters)
-    trained_decoder(node, weights, parameters)  # or says what does not fit
+    saved_decoder(node, weights, parameters)  # or says what does not fit
     names = shape_names(folder, specs, split, len(codes))
     source = config["data"]["source"]
     ids = [shape_id(name, by_synset(source["categories"])) for name in names]
@@ -84,8 +89,10 @@ def import_deepsdf(config: dict[str, Any]) -> Path:
     begin_run(run, config, ids, [], frames, DeepSdfSource.up)
     shutil.copyfile(folder / "specs.json", run / "specs.json")
     state = {f"decoder.{name}": weight for name, weight in weights.items()} | {"codes.table": codes}
-    write_checkpoint({"state_dict": state}, run / "checkpoints" / LAST)
-    print(f"run: {run}: {len(load(run).ids)} shapes, {len(frames)} of them with their source's frame")
+    parameters = {"decoder": node, "shapes": len(codes), "seed": config["seed"]}
+    parameters |= {name: config[name] for name in ("codes", "loss", "optim", "computing")}
+    write_checkpoint({"state_dict": state, "hyper_parameters": parameters}, run / "checkpoints" / LAST)
+    log.info(f"run: {run}: {len(load(run).ids)} shapes, {len(frames)} of them with their source's frame")
     return run
 
 
@@ -219,7 +226,9 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
     places = [Path(split)] if split else [at / specs.TrainSplit for at in above if specs.TrainSplit]
     file = next((place for place in places if place.is_file()), Path(split) if split else None)
     if file is None:
-        print(f"{folder}: its TrainSplit {specs.TrainSplit} is not here: shapes are numbered; or give split=")
+        log.warning(
+            f"{folder}: TrainSplit {specs.TrainSplit} is not here: shapes are numbered; or give split="
+        )
         return [f"shape/{row:05d}" for row in range(count)]
     names = list(names_listed(str(file), "train"))
     if len(names) != count:
@@ -237,9 +246,4 @@ def known_frames(root: Path, name_of: Mapping[str, str]) -> dict[str, Frame]:
 
 def main() -> None:
     """Console entry: `sdfhub import-deepsdf EXPERIMENT_DIR`."""
-    first_word_as("folder")
-
-    def task(config: DictConfig) -> None:
-        import_deepsdf(plain(config))
-
-    run_task(task, "import_deepsdf")
+    run_task(lambda config: import_deepsdf(config) and None, "import_deepsdf", ["folder"])

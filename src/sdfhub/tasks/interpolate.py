@@ -1,33 +1,24 @@
 """Task `interpolate`: the shapes on the way from one to another."""
 
-from typing import Any
-
 from omegaconf import DictConfig
 
+from sdfhub.opening import beside, load
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
 
 
-def interpolate(config: dict[str, Any]) -> None:
+def interpolate(config: DictConfig) -> None:
     """The task: `config` as conf/interpolate.yaml has it."""
-    run, (a, b) = check(config["run"], str, "run"), (check(config[key], str | int, key) for key in "ab")
-    out = check(config["out"], str | None, "out")
-    resolution = check(config["resolution"], int, "resolution")
-    space = load(run)
-    codes = space.interpolate(a, b, check(config["steps"], int, "steps"))
-    ends = [space.ids[space.row(shape)] for shape in (a, b)]
+    space = load(config.run, trust=config.trust or ())
+    codes = space.interpolate(config.a, config.b, config.steps)
+    ends = [space.ids[space.row(shape)] for shape in (config.a, config.b)]
     shares = [index / (len(codes) - 1) for index in range(1, len(codes) - 1)]
     captions = [ends[0], *(f"{share:.2f}" for share in shares), ends[1]]
-    folder = beside(run, out, "interpolate/" + "_to_".join(end.replace("/", "-") for end in ends))
-    write_gallery(space, codes, captions, folder, resolution, animated=True)
+    name = "interpolate/" + "_to_".join(end.replace("/", "-") for end in ends)
+    folder = beside(config.run, config.out, name)
+    write_gallery(space, codes, captions, folder, config.resolution, animated=True)
 
 
 def main() -> None:
-    """Console entry: `sdfhub interpolate run=RUN a=ID b=ID steps=8`."""
-
-    def task(config: DictConfig) -> None:
-        interpolate(plain(config))
-
-    run_task(task, "interpolate")
+    """Console entry: `sdfhub interpolate RUN A B steps=8`."""
+    run_task(interpolate, "interpolate", ["run", "a", "b"])

@@ -1,43 +1,35 @@
-"""Task `neighbours`: the known shapes whose codes are nearest to that of one of them, or of a scan."""
+"""Task `neighbours`: the training shapes whose codes are nearest to that of one of them, or of a scan."""
 
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import beside, load
 from sdfhub.scans.scan import read_scan
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
 
 
-def neighbours(config: dict[str, Any]) -> None:
+def neighbours(config: DictConfig) -> None:
     """The task: `config` as conf/neighbours.yaml has it."""
-    run, shape = check(config["run"], str, "run"), check(config["of"], str | int, "of")
-    out = check(config["out"], str | None, "out")
-    resolution = check(config["resolution"], int, "resolution")
-    space = load(run)
+    space, shape = load(config.run, trust=config.trust or ()), config.of
     if Path(str(shape)).is_file():
-        of, scan = Path(str(shape)).name, read_scan(Path(str(shape)))
+        name, scan = Path(str(shape)).name, read_scan(Path(str(shape)))
         if scan.kind == "view":
             raise SdfhubError(f"of={shape}: is a single view; see `sdfhub reconstruct`, which takes such")
-        shape = space.fit_scan(scan, "shape")
+        shape = space.fit_scan(scan)
     else:
-        of = space.ids[space.row(shape)]
-    found = space.neighbours(shape, check(config["k"], int, "k"))
-    for id, distance in found:
+        name = space.ids[space.row(shape)]
+    nearest = space.neighbours(shape, config.k)
+    for id, distance in nearest:
         print(f"{id:<40} {distance:.4f}")
-    captions = [f"of {of}", *(f"{id}\n{distance:.3f}" for id, distance in found)]
-    codes = space.code([shape, *(id for id, _ in found)])
-    write_gallery(space, codes, captions, beside(run, out, f"neighbours/{of.replace('/', '-')}"), resolution)
+    captions = [f"of {name}", *(f"{id}\n{distance:.3f}" for id, distance in nearest)]
+    codes = space.code([shape, *(id for id, _ in nearest)])
+    folder = beside(config.run, config.out, f"neighbours/{name.replace('/', '-')}")
+    write_gallery(space, codes, captions, folder, config.resolution)
 
 
 def main() -> None:
-    """Console entry: `sdfhub neighbours run=RUN of=ID k=7`."""
-
-    def task(config: DictConfig) -> None:
-        neighbours(plain(config))
-
-    run_task(task, "neighbours")
+    """Console entry: `sdfhub neighbours RUN OF k=7`."""
+    run_task(neighbours, "neighbours", ["run", "of"])

@@ -1,26 +1,35 @@
 """Task `reconstruct`: the shapes behind scans, found in a trained space, as meshes in the scans' frames."""
 
-import json
+import logging
 import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 from omegaconf import DictConfig
 from pydantic import Field
 from tqdm import tqdm
 
+from sdfhub.composition import instantiate, plain
 from sdfhub.data.sources.source import unique_ids
+from sdfhub.data.splits import Split, split
+from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import beside, data_of, load, read_run
+from sdfhub.reconstruction.calibration import Calibration
+from sdfhub.reconstruction.reconstructor import Reconstructor
+from sdfhub.reconstruction.result import Limits, Result, is_result, table
+from sdfhub.scans.observed_scan import ObservedScan, ScanFrame
 from sdfhub.scans.scan import FORMATS
-from sdfhub.scans.target import FrameKind, Target
+from sdfhub.scans.simulated import ScanKind
+from sdfhub.shapes import NORMALIZED
+from sdfhub.space import Space
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.calibration import Alike, Limits, calibrated
-from sdfhub.tasks.opening import beside, clamp, load
-from sdfhub.tasks.reconstructor import Found, Reconstructor, reconstruct_targets, table, write_found
-from sdfhub.tasks.run import leave_no_empty_folder, read_run, refuse_unwritable
+from sdfhub.whole_file import refuse_unwritable
+
+log = logging.getLogger(__name__)
 
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
@@ -33,117 +42,150 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     for path in map(Path, [wanted] if isinstance(wanted, str) else wanted):
         inside = [path]
         if path.is_dir():
-            files = sorted(each for each in path.rglob("*") if each.is_file())
-            files = [each for each in files if not is_result(each)]
-            inside = [each for each in files if each.suffix.lower() in FORMATS]
+            files = sorted(file for file in path.rglob("*") if file.is_file() and not is_result(file))
+            inside = [file for file in files if file.suffix.lower() in FORMATS]
             if not inside:
-                raise SdfhubError(f"target={path}: holds no scans ({' '.join(FORMATS)})")
-            if others := sorted({each.suffix.lower() or each.name for each in set(files) - set(inside)}):
-                print(f"target={path}: passes over what is no scan: {' '.join(others)}", file=sys.stderr)
-        named |= {each: each.stem for each in inside}
+                raise SdfhubError(f"scans={path}: holds no scans ({' '.join(FORMATS)})")
+            if others := sorted({file.suffix.lower() or file.name for file in set(files) - set(inside)}):
+                log.warning("scans=%s: passes over what is no scan: %s", path, " ".join(others))
+        named |= {file: file.stem for file in inside}
     if not named:
-        raise SdfhubError("target: names no scan")
-    often = Counter(named.values())
+        raise SdfhubError("scans: names no scan")
+    count = Counter(named.values())
     return unique_ids(
-        {path: stem if often[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
+        {path: stem if count[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
     )
 
 
-def is_result(path: Path) -> bool:
-    """Whether a mesh is what an earlier command found of a scan: the JSON beside it says so."""
-    try:
-        said = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(said, dict) and "verdict" in said and said.get("mesh") == path.name
-
-
-def read_targets(
-    how: Reconstructor, files: dict[str, Path], sensor: Sequence[float] | None
-) -> tuple[dict[str, Target], list[Found]]:
-    """What the files observe, by name, and those that cannot be used."""
-    targets, failed = {}, []
-    for name, path in tqdm(files.items(), desc="reading", unit="scan", leave=False, disable=None):
-        try:
-            targets[name] = how.target(path, sensor)
-        except SdfhubError as error:
-            failed.append(Found(name, reason=str(error)))
-    return targets, failed
-
-
-def reconstructor(run: Path, config: dict[str, Any]) -> Reconstructor:
-    """The space of a run or an exported file, and how it is to be used."""
-    frame = check(config["frame"], FrameKind, "frame")
-    space = load(run)
-    prior = build(config["prior"], "prior", within="sdfhub.latent")
-    poses = build(config["poses"], "poses", within="sdfhub.latent", up=space.up)
-    return Reconstructor(
+def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]:
+    """What the config names, made: how scans are fitted in a space, and how limits are found."""
+    frame = scan_frame(space, config["frame"], check(config["of"], str | int | None, "of"))
+    poses = instantiate(config.poses, "poses", up=space.up)
+    reconstructor = Reconstructor(
         space,
-        likely=prior(space.codes),
-        method=build(config["method"], "method", within="sdfhub.latent", delta=clamp(space.config)),
-        evidence=build(config["evidence"], "evidence", within="sdfhub.scans"),
+        fit=instantiate(config.fit, "fit"),
+        evidence=instantiate(config.evidence, "evidence"),
         frame=frame,
         poses=poses if frame == "unknown" else None,
         resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
     )
+    return reconstructor, instantiate(config.calibration, "calibration")
+
+
+def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
+    """Where scans lie.
+
+    Args:
+        space: knows where its shapes lie in their sources' frames.
+        frame: shape, normalised, unknown, or source: that of the source of shape `of`.
+        of: id or row; None where all shapes of the space lie alike.
+    """
+    check(frame, Literal["shape", "normalised", "source", "unknown"], "frame")
+    if of is not None and frame != "source":
+        raise SdfhubError(f"of={of}: needs frame=source")
+    if frame != "source":
+        return NORMALIZED if frame == "normalised" else frame
+    if of is not None:
+        id = space.ids[space.row(of)]
+        if id not in space.frames:
+            raise SdfhubError(f"of={of}: the run does not know where {id} lies in its source's frame")
+        return space.frames[id]
+    frames = {(*map(float, known.center), known.scale): known for known in space.frames.values()}
+    if len(frames) != 1:
+        raise SdfhubError("frame=source: shapes of this run lie differently; name one with of=ID")
+    return next(iter(frames.values()))
+
+
+def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape]:
+    """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source.
+
+    Args:
+        run: its folder.
+        config: of the task; its `data.store` and `data.workers` stand in for the run's own.
+        count: how many.
+    """
+    trained, roles = read_run(run)
+    data = data_of(trained, config.trust or ())
+    data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
+    offered = {shape.id: shape for shape in data.source.shapes()}
+    first = [offered[id] for id in roles["held_out"] if id in offered][:count]
+    used = {*roles["train"], *roles["held_out"]}
+    rest = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
+    rest = [shape for shape in rest if shape.split == "held_out"] or rest
+    more = split(rest, 0, min(count - len(first), len(rest)), seed=0).held_out
+    return list(data.filled(Split([], first + more)))
 
 
 def limits_of(
-    run: Path, how: Reconstructor, kinds: Sequence[Alike], config: dict[str, Any]
-) -> dict[Alike, Limits]:
+    run: Path,
+    reconstructor: Reconstructor,
+    calibration: Calibration,
+    kinds: Sequence[ScanKind],
+    config: DictConfig,
+) -> dict[ScanKind, Limits]:
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
-    calibration = build(config["calibration"], "calibration")
     if not calibration.shapes:
         return {}
-    settings = {key: config[key] for key in ("method", "prior", "evidence", "calibration")}
-    settings["poses"] = config["poses"] if how.poses else None
+    settings = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
+    settings["poses"] = plain(config.poses) if reconstructor.poses else None
     try:
-        trained, roles = read_run(run)
-        return calibrated(run, trained, roles, calibration, kinds, how, settings, config["data"])
-    except (SdfhubError, OSError, LookupError, TypeError) as error:  # whatever an older run lacks
-        print(f"no verdicts: {error}", file=sys.stderr)
+        return calibration.limits(
+            run, settings, kinds, reconstructor, lambda count: unseen_shapes(run, config, count)
+        )
+    except (SdfhubError, OSError, LookupError, TypeError) as error:  # an older run may lack anything
+        log.warning("no verdicts: %s", error)
         return {}
 
 
-def reconstruct_run(config: dict[str, Any]) -> list[Found]:
-    """Finds the shapes behind what `target` names, as `config` (conf/reconstruct.yaml) says."""
-    run = Path(check(config["run"], str, "run"))
-    out = beside(str(run), check(config["out"], str | None, "out"), "reconstructions")
-    sensor = check(config["sensor"], tuple[float, float, float] | None, "sensor")
-    together = check(config["together"], Annotated[int, Field(ge=1)], "together")
-    files = scan_files(check(config["target"], str | list[str], "target"))
+def reconstruct_run(config: DictConfig) -> list[Result]:
+    """Finds the shapes behind `scans`, as `config` (conf/reconstruct.yaml) says."""
+    run, settings = Path(str(config.run)), plain(config)
+    out = beside(str(run), config.out, "reconstructions")
+    sensor = check(settings["sensor"], tuple[float, float, float] | None, "sensor")
+    together = check(settings["together"], Annotated[int, Field(ge=1)], "together")
+    files = scan_files(check(settings["scans"], str | list[str], "scans"))
     for name, path in files.items():
         result = out / f"{name}.ply"
         if result.resolve() == path.resolve() or (result.exists() and not is_result(result)):
             raise SdfhubError(
                 f"out={out}: the result of {path} would overwrite {result}; choose another folder"
             )
-    how = reconstructor(run, config)
+    reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
-    targets, results = read_targets(how, files, sensor)
-    kinds = list(dict.fromkeys(map(Alike.to, targets.values())))
-    limits = limits_of(run, how, kinds, config) if targets else {}
-    together = 1 if how.space.device.type == "cpu" else together
-    found = reconstruct_targets(how, targets, limits, out, together)
-    results += tqdm(found, total=len(targets), desc="fitting", unit="scan", leave=False, disable=None)
-    failed = [each for each in results if each.verdict == "failed"]
-    if len(failed) < len(results):
-        print(f"{table(results)}\n\nmeshes and codes: {out}")
-    else:
-        leave_no_empty_folder(out)
-    for each in failed:
-        # what an earlier command found of a scan of this name stays
-        if len(failed) < len(results) and not (out / f"{each.name}.json").exists():
-            write_found(each, out)
-        print(f"sdfhub: error: {each.reason}", file=sys.stderr)
+    scans: dict[str, ObservedScan] = {}
+    results: list[Result] = []
+    for name, path in tqdm(files.items(), desc="reading", unit="scan", leave=False, disable=None):
+        try:
+            scans[name] = reconstructor.read(path, sensor)
+        except SdfhubError as error:
+            results.append(Result(name, reason=str(error)))
+    kinds = list(dict.fromkeys(map(ScanKind.of, scans.values())))
+    limits = limits_of(run, reconstructor, calibration, kinds, config) if scans else {}
+    together = 1 if reconstructor.space.device.type == "cpu" else together
+    made = reconstructor.reconstruct(scans, limits, out, together)
+    results += tqdm(made, total=len(scans), desc="fitting", unit="scan", leave=False, disable=None)
+    report(results, out)
     return results
 
 
+def report(results: Sequence[Result], out: Path) -> None:
+    """Prints the table; says and writes down why scans failed."""
+    failed = [result for result in results if result.verdict == "failed"]
+    if len(failed) < len(results):
+        print(f"{table(results)}\n\nmeshes and codes: {out}")
+    for result in failed:
+        # the result of an earlier command for a scan of this name stays
+        if len(failed) < len(results) and not (out / f"{result.name}.json").exists():
+            result.write(out)
+        print(f"sdfhub: error: {result.reason}", file=sys.stderr)
+
+
+def reconstruct(config: DictConfig) -> None:
+    """The task: `config` as conf/reconstruct.yaml has it."""
+    if any(result.verdict == "failed" for result in reconstruct_run(config)):
+        sys.exit(1)
+
+
 def main() -> None:
-    """Console entry: `sdfhub reconstruct run=RUN target=scan.ply`. Exit status 1 if a scan failed."""
-
-    def task(config: DictConfig) -> None:
-        if any(found.verdict == "failed" for found in reconstruct_run(plain(config))):
-            sys.exit(1)
-
-    run_task(task, "reconstruct")
+    """Console entry: `sdfhub reconstruct RUN SCAN ...`. Exit status 1 if a scan failed."""
+    run_task(reconstruct, "reconstruct", ["run", "scans..."])

@@ -1,30 +1,29 @@
-"""Task `report`: a sweep's folder becomes tables, claims and one page that opens offline."""
+"""Task `report`: a sweep's folder becomes tables, pictures and one page that opens offline."""
 
 import hashlib
+import logging
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
-from sdfhub.data.store.shards import StoredShape
 from sdfhub.data.store.store import Store, preparation_hash
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
-from sdfhub.report.formats import csv_text, latex, markdown, shapes_csv
+from sdfhub.opening import data_of
 from sdfhub.report.meshes import FindTruth
-from sdfhub.report.origin import origin_table
 from sdfhub.report.page import page
 from sdfhub.report.pictures import Gallery, Sheet
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
-from sdfhub.report.rows import Group, group_cells
-from sdfhub.report.tables import claims_table, overview, tables
-from sdfhub.tasks.app import first_word_as, run_task
-from sdfhub.tasks.build import build, check, plain
-from sdfhub.tasks.run import refuse_unwritable
-from sdfhub.whole_file import write_whole
+from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
+from sdfhub.report.tables import latex, markdown, origin, overview, tables
+from sdfhub.tasks.app import run_task
+from sdfhub.whole_file import refuse_unwritable, write_whole
+
+log = logging.getLogger(__name__)
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
@@ -41,35 +40,38 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     Raises:
         SdfhubError: not a sweep's folder.
     """
-    cells = read_sweep(sweep)
+    cells, commands = read_sweep(sweep), read_plan(sweep).commands
     groups = group_cells(cells)
-    all_tables = [*overview(groups), *(table for group in groups for table in tables(group))]
-    print("\n" + markdown(all_tables))
-    claims = [claims_table(group) for group in groups]
-    origin = origin_table(read_plan(sweep).commands, cells)
-    write_whole(out / "table.md", f"# {sweep.name}\n\n{markdown([*all_tables, *claims, origin])}")
-    write_whole(out / "table.tex", latex(all_tables))
-    write_whole(out / "table.csv", csv_text(groups))
+    titles = ["All tables", *(group.title for group in groups), "Origin"]
+    found = [overview(groups), *map(tables, groups), [origin(commands, cells)]]
+    sections = [(title, some) for title, some in zip(titles, found, strict=True) if some]
+    text = "\n".join(markdown(title, some) for title, some in sections)
+    print(f"\n{text}")
+    write_whole(out / "table.md", f"# {sweep.name}\n\n{text}")
+    write_whole(out / "table.tex", latex(sections))
+    write_whole(out / "table.csv", table_csv(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
     gallery = Gallery(truth_finder())
-    whole_page = page(sweep.name, cells, groups, origin, gallery, shapes)
-    for group in groups:
-        write_sheet(gallery.sheet(group, shapes), out / f"{sheet_name(group)}.png")
-    write_whole(out / "report.html", whole_page)
+    sheets, turning = gallery.sheets(groups, shapes), gallery.turning(groups, shapes)
+    for group, (sheet, _) in zip(groups, sheets, strict=True):
+        write_sheet(sheet, out / f"{sheet_name(group)}.png")
+    write_whole(out / "report.html", page(sweep.name, cells, groups, found, sheets, turning))
     print(f"report: {out / 'report.html'}", flush=True)
     return cells
 
 
 def sheet_name(group: Group) -> str:
     """A name of its own for each group of a sweep."""
-    said = ";".join(f"{key}={value}" for key, value in group.said.items())
+    choices = [group.judging[name] for name in JUDGING_GROUPS if name in group.judging]
+    settings = sorted(set(group.judging) - set(JUDGING_GROUPS))
+    said = ";".join(f"{key}={group.judging[key]}" for key in settings)
     digest = [hashlib.sha256(said.encode()).hexdigest()[:8]] if said else []
-    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *group.choices.values(), *digest]))
+    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *choices, *digest]))
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
-    rows = [[tile.alt if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
+    rows = [[tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
     if rows and sheet.columns:
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
@@ -80,8 +82,7 @@ def truth_finder() -> FindTruth:
     stores: dict[str, Store | None] = {}
 
     def find(cell: Cell, id: str) -> StoredShape | None:
-        data = cell.scores.config["data"]
-        key = str([data.get(name) for name in ("source", "preparation", "store")])
+        key = str(cell.scores.config.get("data"))
         if key not in stores:
             stores[key] = _store(cell.scores.config)
         store = stores[key]
@@ -92,40 +93,28 @@ def truth_finder() -> FindTruth:
 
 def _store(config: dict[str, Any]) -> Store | None:
     try:
-        data = config["data"]
-        source = build(data["source"], "data.source", within="sdfhub.data.sources")
-        preparation = build(data["preparation"], "data.preparation", within="sdfhub.data")
-        store = Store.open(Path(data["store"]) / source.name / preparation_hash(preparation))
+        data = data_of(config)
+        store = Store.open(Path(data.store) / data.source.name / preparation_hash(data.preparation))
     except (SdfhubError, KeyError, TypeError, AttributeError):
         return None  # not on this machine: a report without ground truth
     for shape in store:
-        shape.up = source.up
+        shape.up = data.source.up
     return store
 
 
-def report(config: dict[str, Any]) -> None:
+def report(config: DictConfig) -> None:
     """The task: `config` as conf/report.yaml has it."""
-    sweep = Path(check(config["sweep"], str, "sweep"))
-    out = check(config["out"], str | None, "out")
-    shapes = check(config["shapes"], int, "shapes")
-    if shapes < 1:
-        raise SdfhubError(f"shapes={shapes}: must be at least 1")
-    folder = Path(out) if out else sweep / "report"
+    sweep = Path(config.sweep)
+    if config.shapes < 1:
+        raise SdfhubError(f"shapes={config.shapes}: must be at least 1")
+    folder = Path(config.out) if config.out else sweep / "report"
     read_plan(sweep)  # what is no sweep gets no folder
     refuse_unwritable(folder)
-    cells = write_report(sweep, folder, shapes)
-    failed = [cell for cell in cells if cell.state == "failed"]
-    if failed:
-        is_search = any("search" in cell.plan.choices for cell in cells)
-        again = "" if is_search else "; the command of the sweep tries them again"
-        print(f"sdfhub: {len(failed)} of {len(cells)} cells failed{again}", file=sys.stderr)
+    cells = write_report(sweep, folder, config.shapes)
+    if failed := sum(cell.state == "failed" for cell in cells):
+        log.warning("%d of %d cells failed; the command of the sweep tries them again", failed, len(cells))
 
 
 def main() -> None:
     """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    first_word_as("sweep")
-
-    def task(config: DictConfig) -> None:
-        report(plain(config))
-
-    run_task(task, "report")
+    run_task(report, "report", ["sweep"])

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import read_run
 from sdfhub.settings import WHERE_NOT_WHAT, flat
-from sdfhub.tasks.run import read_run
 
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings under which a run may be continued though it was started with others."""

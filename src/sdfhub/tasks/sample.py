@@ -1,33 +1,24 @@
-"""Task `sample`: new shapes, drawn from a Gaussian fitted to the codes of the known ones."""
-
-from typing import Any
+"""Task `sample`: new shapes, drawn from a Gaussian fitted to the codes of the training shapes."""
 
 from omegaconf import DictConfig
 
+from sdfhub.opening import beside, load
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import Seed, check, plain
 from sdfhub.tasks.gallery import write_gallery
-from sdfhub.tasks.opening import beside, load
 
 
-def sample(config: dict[str, Any]) -> None:
+def sample(config: DictConfig) -> None:
     """The task: `config` as conf/sample.yaml has it."""
-    run, seed = check(config["run"], str, "run"), check(config["seed"], Seed, "seed")
-    out = check(config["out"], str | None, "out")
-    resolution = check(config["resolution"], int, "resolution")
-    space = load(run)
-    codes = space.sample(check(config["n"], int, "n"), seed)
+    space = load(config.run, trust=config.trust or ())
+    codes = space.sample(config.n, config.seed)
     nearest = [space.neighbours(code, 1)[0] for code in codes]
     for index, (id, distance) in enumerate(nearest):
-        print(f"{index:03d}  nearest known shape: {id} ({distance:.4f})")
+        print(f"{index:03d}  nearest training shape: {id} ({distance:.4f})")
     captions = [f"new\nnearest {id}" for id, _ in nearest]
-    write_gallery(space, codes, captions, beside(run, out, f"sample/seed_{seed}"), resolution)
+    folder = beside(config.run, config.out, f"sample/seed_{config.seed}")
+    write_gallery(space, codes, captions, folder, config.resolution)
 
 
 def main() -> None:
-    """Console entry: `sdfhub sample run=RUN n=8`."""
-
-    def task(config: DictConfig) -> None:
-        sample(plain(config))
-
-    run_task(task, "sample")
+    """Console entry: `sdfhub sample RUN n=8`."""
+    run_task(sample, "sample", ["run"])

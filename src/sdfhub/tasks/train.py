@@ -1,67 +1,58 @@
 """Task `train`: samples in, a shape space out, and the table that judges it."""
 
-import os
-import re
-import sys
+import logging
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig
-from pydantic import NonNegativeFloat, PositiveInt
-from torch import Tensor
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 
-from sdfhub.callbacks.checkpoints import WholeFileIO, checkpointing
-from sdfhub.callbacks.showing import LossBar, LossLines, TrainingRecord
-from sdfhub.data.loading.batches import Loading
-from sdfhub.data.loading.datamodule import SdfDataModule
+from sdfhub.callbacks.checkpoints import WholeFileIO
+from sdfhub.callbacks.progress import fitting_callbacks
+from sdfhub.callbacks.training_record import TrainingRecord
+from sdfhub.checkpoint_file import LAST, read_checkpoint
+from sdfhub.composition import instantiate, plain, with_absolute_paths
+from sdfhub.data.loading import SdfDataModule
+from sdfhub.described import check, located
 from sdfhub.errors import SdfhubError
+from sdfhub.evaluation.judging import Evaluation, evaluate_model
+from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.model.fast.computing import bfloat16_rate
+from sdfhub.model.optimisers import Optimisation
+from sdfhub.multirun.cells import go_on, run_cell
+from sdfhub.multirun.processes import ending_together, refuse_processes_in_multirun
+from sdfhub.multirun.search import objective
+from sdfhub.opening import begin_run
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.tasks.apart import CELL, must_run_apart, train_apart
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import Seed, build, check, plain
-from sdfhub.tasks.cells import go_on, run_cell
-from sdfhub.tasks.evaluate import Evaluation, build_evaluation, evaluate_model
-from sdfhub.tasks.made_with import made_with
-from sdfhub.tasks.prepare import Prepared, prepare_data
-from sdfhub.tasks.processes import ending_together
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
-from sdfhub.tasks.run import (
-    begin_run,
-    build_autodecoder,
-    put_weights,
-    read_weights,
-    refuse_unwritable,
-)
-from sdfhub.tasks.search import objective
-from sdfhub.tasks.sweep import MULTIRUNS, refuse_second_multirun
 
-PRECISIONS = ("32-true", "32", "bf16-mixed", "bf16", "None")
-"""Not all that Lightning offers: pieces of a batch are differentiated without a loss scale, and the loops
-know float32 and bfloat16."""
-STRATEGIES = ("auto", "ddp")
-"""Beginnings of those that leave a model whole: checkpoints, and what is drawn and judged while it trains,
-need every weight."""
+log = logging.getLogger(__name__)
 
-SLOW = 0.8
-"""Share of float32's rate below which bfloat16 does not pay; no processor known to us is near it."""
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
+"""Half precision needs a loss scale; pieces of a batch are differentiated without one."""
+WHOLE_MODEL = ("auto", "ddp")
+"""Beginnings of the strategies that leave every weight on every device, as meshing and judging need."""
 
 NO_CONCERN = (
     ".*does not have many workers.*",
     ".*number of training batches.*smaller than the logging interval.*",
     ".*The dirpath has changed.*",  # a continued run has a folder of its own
     ".*Checkpoint directory .* exists and is not empty.*",
-    ".*ended before the epoch ended.*",  # our loader starts from the step that a checkpoint ends with
+    ".*ended before the epoch ended.*",  # the loader starts from the step that a checkpoint ends with
     ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
 )
 """Lightning's warnings that a user can do nothing about."""
@@ -69,64 +60,150 @@ NO_CONCERN = (
 
 @dataclass(frozen=True)
 class Parts:
-    """What a config describes, built and so checked before the first shape is prepared."""
+    """What a config describes, made once, before the first shape is prepared."""
 
-    evaluation: Evaluation
-    loading: Loading
+    data: SdfDataModule
+    model: partial[AutoDecoder]
     trainer: Trainer
     record: TrainingRecord
-    resume_from: Path | None
-    weights: dict[str, Tensor] | None
+    evaluation: Evaluation
 
 
-def train(config: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Trains what a plain config describes into the folder `run`.
+def train(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Trains what a composed config describes into a folder.
 
     Returns:
-        What `metrics.json` holds; empty in processes of a distributed run that are not the first.
+        What `metrics.json` holds; empty for `fast_dev_run` and for processes of a distributed run that are
+        not the first.
     """
-    for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
-        warnings.filterwarnings("ignore", message)
-    parts = build_parts(config, run)
-    if must_run_apart(parts.trainer):
-        return train_apart(run)
-    if parts.loading.surface_per_shape:
-        refuse_missing_normals(config["data"])
-    refuse_unwritable(run)
-    prepared = prepare_data(config["data"])
-    if parts.resume_from:
-        refuse_other_shapes(parts.resume_from, [shape.id for shape in prepared.train])
-    loader = SdfDataModule(prepared.train, parts.loading)
-    model = build_autodecoder(config, loader.rows, training_steps(config["trainer"], loader.steps_per_epoch))
-    if parts.weights:
-        put_weights(model, parts.weights, parts.resume_from)
+    parts, written = make_parts(config, folder), plain(config)
+    refuse_processes_in_multirun(parts.trainer)
+    if config.ckpt_path:
+        read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
+        refuse_other_settings(Path(config.ckpt_path), written)
+    parts.data.prepare_data()
+    parts.data.setup("fit")
+    ids = [shape.id for shape in parts.data.train_shapes]
+    if config.ckpt_path:
+        refuse_other_shapes(Path(config.ckpt_path), ids)
+    model = parts.model(shapes=parts.data.rows)
     begin_run(
-        run,
-        config,
-        train=[shape.id for shape in prepared.train],
-        held_out=[shape.id for shape in prepared.held_out],
-        frames={shape.id: Frame(shape.center, shape.scale) for shape in prepared.train},
-        up=prepared.train[0].up,
+        folder,
+        written | {"data": with_absolute_paths(written["data"])},
+        train=ids,
+        held_out=[shape.id for shape in parts.data.held_out_shapes],
+        frames={shape.id: Frame(shape.center, shape.scale) for shape in parts.data.train_shapes},
+        up=parts.data.train_shapes[0].up,
     )
-    print(f"run: {run}", flush=True)
-    warn_of_slow_bfloat16(parts.trainer, config["decoder"]["width"])
-    fit(model, loader, parts)
+    log.info("run: %s", folder)
+    log_settings(parts.trainer, written)
+    fit(model, parts, config.ckpt_path)
     if not parts.trainer.is_global_zero:
         return {}
-    metrics = judge(model, prepared, parts, run)
-    parts.trainer.logger.log_hyperparams(flat(config), final_scores(metrics))
+    if parts.trainer.fast_dev_run:
+        log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
+        return {}
+    checkpoint = folder / "checkpoints" / LAST
+    if not checkpoint.exists():  # callbacks without one of checkpoints
+        parts.trainer.save_checkpoint(checkpoint)
+    metrics = judge(model, parts, folder)
+    log_scores(parts.trainer, written, metrics)
     return metrics
 
 
-def fit(model: AutoDecoder, loader: SdfDataModule, parts: Parts) -> None:
-    """Trains, from the checkpoint that the parts name, if any.
+def make_parts(config: DictConfig, folder: Path) -> Parts:
+    """The objects of a training.
+
+    Raises:
+        SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
+    """
+    for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
+        warnings.filterwarnings("ignore", message)
+    torch.manual_seed(check(config.seed, Seed, "seed"))
+    model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
+    model["optim"] = make_optimisation(config.optim)
+    validation = config.get("validation")
+    model["validation"] = instantiate(validation, "validation") if validation else None
+    record = TrainingRecord()
+    callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
+    loggers = named_parts(config.get("logger"), "logger", Logger)
+    trainer = make_trainer(config.trainer, folder, callbacks, loggers)
+    model["computing"].refuse_impossible(model["decoder"].encoding, trainer.strategy.root_device)
+    return Parts(
+        data=instantiate(config.data, "data"),
+        model=partial(AutoDecoder, **model, seed=config.seed),
+        trainer=trainer,
+        record=record,
+        evaluation=instantiate(config.evaluate, "evaluate"),
+    )
+
+
+def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
+    """The objects of a group of named parts; a part that is null is left out.
+
+    Raises:
+        SdfhubError: a part is no such object.
+    """
+    parts = []
+    for name, node in (config or {}).items():
+        if node is not None:
+            parts.append(instantiate(node, f"{group}.{name}"))
+            if not isinstance(parts[-1], kind):
+                raise SdfhubError(f"{group}.{name}: is no Lightning {kind.__name__}; give it a _target_")
+    return parts
+
+
+def make_optimisation(config: DictConfig) -> Optimisation:
+    """What `optim` describes; its `_target_` may be an optimiser of PyTorch, in the place of Adam."""
+    if issubclass(located(config._target_, "optim"), torch.optim.Optimizer):
+        return Optimisation.of(hydra.utils.instantiate(config, _convert_="all", _partial_=True))
+    return Optimisation.of(instantiate(config, "optim"))
+
+
+def make_trainer(
+    config: DictConfig, folder: Path, callbacks: list[Callback], loggers: list[Logger]
+) -> Trainer:
+    """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours.
+
+    Raises:
+        SdfhubError: names a setting that would give a wrong result, or that this machine cannot do.
+    """
+    if str(config.get("precision")) in WRONG_PRECISIONS:
+        raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
+    if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
+        raise SdfhubError(
+            f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
+        )
+    has_logger = bool(loggers if config.get("logger") is None else config.logger)
+    callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
+    ours = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
+    ours |= {
+        "plugins": [WholeFileIO()],
+        "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks),
+    }
+    given = {name: value for name, value in ours.items() if config.get(name) is None}
+    trainer = instantiate(config, "trainer", **given)
+    for name in (
+        "lightning",
+        "lightning.pytorch",
+        "lightning.fabric",
+    ):  # through our handlers, into train.log
+        logging.getLogger(name).handlers.clear()
+        logging.getLogger(name).propagate = True
+    for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
+        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
+    return trainer
+
+
+def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
+    """Trains, from a checkpoint if one is named.
 
     Raises:
         SdfhubError: the samples or a piece of a batch do not fit the GPU.
     """
     with ending_together(parts.trainer):
         try:
-            parts.trainer.fit(model, datamodule=loader, ckpt_path=parts.resume_from, weights_only=True)
+            parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
         except torch.OutOfMemoryError as error:
             raise SdfhubError(
                 "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
@@ -134,154 +211,53 @@ def fit(model: AutoDecoder, loader: SdfDataModule, parts: Parts) -> None:
             ) from error
 
 
-def warn_of_slow_bfloat16(trainer: Trainer, width: int) -> None:
-    """Tells of a CPU that multiplies float32 faster than the bfloat16 which it is asked for."""
-    if trainer.precision != "bf16-mixed" or trainer.strategy.root_device.type != "cpu":
-        return
-    rate = bfloat16_rate(width)
-    if rate < SLOW and trainer.is_global_zero:
-        print(
-            f"trainer.precision=bf16-mixed: this CPU multiplies bfloat16, {width} wide, {1 / rate:.1f} times "
-            "slower than float32; 32-true is faster here, and more exact",
-            file=sys.stderr,
-        )
-
-
-def judge(model: AutoDecoder, prepared: Prepared, parts: Parts, run: Path) -> dict[str, Any]:
-    """What `metrics.json` holds: the training's cost and the scores of known and unseen shapes."""
+def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
+    """What `metrics.json` holds: the training's cost and the scores of training and held-out shapes."""
     training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
     if not parts.record.stepped:
-        print(
-            f"{parts.resume_from}: its training was finished (trainer.max_epochs would prolong it); judging"
-        )
-    known = dict(enumerate(prepared.train))
+        log.info("the training was finished before (trainer.max_epochs would prolong it); judging")
     model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
-    codes = model.codes.table.detach()
-    return evaluate_model(model.decoder, codes, known, prepared.held_out, parts.evaluation, run, training)
+    train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
+    codes, delta = model.codes.table.detach(), model.loss.delta
+    return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
 
 
-def training_steps(trainer: dict[str, Any], steps_per_epoch: int) -> int:
-    """Optimiser steps of a whole training, from the trainer's `max_epochs` and `max_steps`.
-
-    Raises:
-        SdfhubError: `max_epochs` is no positive number; schedules need an end.
-    """
-    epochs = check(trainer["max_epochs"], int | None, "trainer.max_epochs")
-    if epochs is None or epochs < 1:
-        raise SdfhubError(f"trainer.max_epochs={epochs}: must be at least 1")
-    limit = check(trainer.get("max_steps", -1), int, "trainer.max_steps")
-    if limit == 0:
-        raise SdfhubError("trainer.max_steps=0: must be at least 1, or -1 for none")
-    return epochs * steps_per_epoch if limit < 0 else min(epochs * steps_per_epoch, limit)
+def log_settings(trainer: Trainer, config: dict[str, Any]) -> None:
+    """Gives every logger the run's settings, but TensorBoard, which takes them once, with the scores."""
+    for logger in trainer.loggers:
+        if not isinstance(logger, TensorBoardLogger):
+            logger.log_hyperparams(flat(config))
 
 
-def build_parts(config: dict[str, Any], run: Path) -> Parts:
-    """The parts of a training run.
-
-    Raises:
-        SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
-    """
-    config["seed"] = check(config["seed"], Seed, "seed")
-    resume_from = check(config["ckpt_path"], Path | None, "ckpt_path")
-    every = {
-        key: check(value, PositiveInt | None, f"checkpoint.{key}")
-        for key, value in config["checkpoint"].items()
-    }
-    if unknown := every.keys() - {"every_n_epochs", "snapshot_every_n_epochs"}:
-        raise SdfhubError(f"checkpoint.{min(unknown)}: no such setting")
-    callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    weights = read_weights(resume_from) if resume_from else None
-    model = build_autodecoder(config, rows=len(weights["codes.table"]) if weights else 1)
-    if weights:
-        refuse_other_settings(resume_from, config)
-        put_weights(model, weights, resume_from)  # before the first shape is prepared
-    training_steps(config["trainer"], 1)
-    record = TrainingRecord()
-    callbacks += [record, *checkpointing(run / "checkpoints", **every)]
-    bar = check(config["trainer"].get("enable_progress_bar", True), bool, "trainer.enable_progress_bar")
-    watched = bar and sys.stdout.isatty()
-    if bar:  # in a file a bar is ten thousand lines
-        callbacks.append(LossBar() if watched else LossLines())
-    trainer = build_trainer(config["trainer"] | {"enable_progress_bar": watched}, run, callbacks)
-    model.computing.refuse_impossible(model.decoder.encoding, trainer.strategy.root_device)
-    return Parts(
-        evaluation=build_evaluation(config["evaluate"], config["loss"]),
-        loading=build(config["data"]["loader"], "data.loader"),
-        trainer=trainer,
-        record=record,
-        resume_from=resume_from,
-        weights=weights,
-    )
-
-
-def refuse_missing_normals(data: dict[str, Any]) -> None:
-    """Refuses a source without surface normals, before hours go into preparing it.
-
-    Raises:
-        SdfhubError: the source's shapes carry none.
-    """
-    source = build(data["source"], "data.source", within="sdfhub.data.sources")
-    if not source.has_normals:
-        raise SdfhubError(f"normals=on: the files of data={source.name} carry none; train with normals=off")
-
-
-def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
-    """Mean and median CD and shapes without a surface by role, for TensorBoard's table of runs."""
-    scores = {}
-    for role in ("known", "held_out"):
+def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:
+    """Mean and median CD x 10^3 and shapes without a surface by role, at the last step, as `final/...`."""
+    scores: dict[str, float] = {}
+    for role in ("train", "held_out"):
         summary = metrics.get(role, {}).get("summary", {})
-        values = {f"cd_{name}": summary.get("cd", {}).get(name) for name in ("mean", "median")}
-        values["failed"] = summary.get("failed")
-        scores |= {f"final/{role}_{name}": value for name, value in values.items() if value is not None}
-    return scores
+        for name in ("mean", "median"):
+            if (value := summary.get("cd", {}).get(name)) is not None:
+                scores[f"final/{role}_cd_{name}"] = value * 1e3
+        if "failed" in summary:
+            scores[f"final/{role}_failed"] = summary["failed"]
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.log_hyperparams(flat(config), scores, step=trainer.global_step)
+        else:
+            logger.log_metrics(scores, trainer.global_step)
+        logger.save()
 
 
-def build_trainer(node: dict[str, Any], run: Path, callbacks: list[Callback]) -> Trainer:
-    """The trainer, or one line that says what it cannot do on this machine, or would do wrongly.
-
-    Raises:
-        SdfhubError: names the setting.
-    """
-    if str(node.get("precision")) not in PRECISIONS:
-        raise SdfhubError(f"trainer.precision={node['precision']!r}: use 32-true or bf16-mixed")
-    if not str(node.get("strategy", "auto")).startswith(STRATEGIES):
-        raise SdfhubError(
-            f"trainer.strategy={node['strategy']}: use auto or ddp; every device has all weights"
-        )
-    check(node.get("gradient_clip_val"), NonNegativeFloat | None, "trainer.gradient_clip_val")
-    logger = TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False)
-    ours = {"default_root_dir": run, "logger": logger, "callbacks": callbacks, "plugins": WholeFileIO()}
-    make = build(node, "trainer", within="lightning.pytorch", **ours)
-    try:
-        trainer = make()
-    except (ValueError, TypeError, RuntimeError, ImportError, MisconfigurationException) as error:
-        absent = isinstance(error, ImportError) or re.search("ccelerator|backend", str(error))
-        hint = "; trainer.accelerator=auto trainer.devices=auto takes what this machine has" if absent else ""
-        raise SdfhubError(f"trainer: {str(error).rstrip('.!')}{hint}") from error
-    if trainer.accumulate_grad_batches != 1:  # large batches are worked on in pieces anyway
-        raise SdfhubError(
-            "trainer.accumulate_grad_batches: a step is one batch; raise data.loader.samples_per_shape"
-        )
-    limit = trainer.limit_train_batches  # 1 means one batch, 1.0 all of them
-    if limit != 1.0 or isinstance(limit, int):  # schedules and draws count all steps of an epoch
-        raise SdfhubError(
-            "trainer.limit_train_batches: an epoch has data.loader.passes_per_epoch passes; set that"
-        )
-    return trainer
+def run(config: DictConfig) -> float | None:
+    """One run, or one cell of a multirun, of a composed config with Hydra's own part set."""
+    hydra = HydraConfig.get()
+    if config.print_config:
+        log.info(OmegaConf.to_yaml(config))
+    if hydra.mode == RunMode.MULTIRUN:
+        return objective(run_cell(train, config, hydra))
+    go_on(train, config, Path(hydra.runtime.output_dir))
+    return None
 
 
 def main() -> None:
     """Console entry: `python train.py activation=hosc encoding=fourier`."""
-
-    def task(config: DictConfig) -> float | None:
-        hydra = HydraConfig.get()
-        if hydra.mode == RunMode.MULTIRUN:
-            return objective(run_cell(train, config, hydra))
-        refuse_second_multirun(hydra)  # or it would be told to add -m, and then this
-        for group in MULTIRUNS:
-            if (name := hydra.runtime.choices.get(group)) and CELL not in os.environ:
-                raise SdfhubError(f"{group}={name}: is a table of runs; add -m")
-        go_on(train, plain(config), Path(hydra.runtime.output_dir))
-        return None
-
-    run_task(task, "config")
+    run_task(run, "config")

@@ -2,39 +2,32 @@
 
 import threading
 from pathlib import Path
-from typing import Annotated, Any
 
 from omegaconf import DictConfig
-from pydantic import Field
 
 from sdfhub.errors import SdfhubError
+from sdfhub.opening import load
 from sdfhub.tasks.app import run_task
-from sdfhub.tasks.build import check, plain
-from sdfhub.tasks.opening import load
 
 
-def view(config: dict[str, Any]) -> None:
+def view(config: DictConfig) -> None:
     """The task: `config` as conf/view.yaml has it. Returns when the process is interrupted."""
-    run = check(config["run"], str, "run")
-    port = check(config["port"], Annotated[int, Field(ge=0, le=65535)], "port")
-    resolution = check(config["resolution"], Annotated[int, Field(ge=8, le=512)], "resolution")
+    if not 0 <= config.port <= 65535 or not 8 <= config.resolution <= 512:
+        raise SdfhubError(f"port={config.port}, resolution={config.resolution}: 0 to 65535, and 8 to 512")
     try:
         from sdfhub.viewer.page import Viewer
     except ImportError as error:
         raise SdfhubError("view: needs more packages: pip install 'sdfhub[view]'") from error
-    viewer = Viewer(load(run), Path(run).resolve().name, port, resolution)
+    space = load(config.run, trust=config.trust or ())
+    viewer = Viewer(space, Path(config.run).resolve().name, config.port, config.resolution)
     try:
         viewer.drawn.wait()  # the first mesh waits for compilers
-        print(f"http://127.0.0.1:{viewer.server.get_port()} shows {run}; Ctrl-C ends it", flush=True)
+        print(f"http://127.0.0.1:{viewer.server.get_port()} shows {config.run}; Ctrl-C ends it", flush=True)
         threading.Event().wait()
     finally:
         viewer.close()
 
 
 def main() -> None:
-    """Console entry: `sdfhub view run=RUN`."""
-
-    def task(config: DictConfig) -> None:
-        view(plain(config))
-
-    run_task(task, "view")
+    """Console entry: `sdfhub view RUN`."""
+    run_task(view, "view", ["run"])

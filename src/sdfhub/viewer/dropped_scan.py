@@ -8,8 +8,8 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.scans import scan as scans
+from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import Scan, read_scan
-from sdfhub.scans.target import observed
 from sdfhub.space import Space
 
 FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
@@ -38,13 +38,13 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
         path.write_bytes(content)
         try:
             scan = read_scan(path)
-            target = observed(scan, space.evidence, "shape", np.random.default_rng(0))
-            code = space.method(space.decoder, space.codes, [target.observation]).codes[0]
+            seen = observe(scan, space.evidence, "shape", np.random.default_rng(0))
+            code = space.fit_observations([seen.observation]).codes[0]
         except (SdfhubError, ValueError) as error:
             reason = str(error).replace(str(path), name)
             raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
     points = surface_points(scan, np.random.default_rng(0))
-    return code, ((points - target.center) * target.scale).astype(np.float32)
+    return code, seen.frame.to_normalized(points).astype(np.float32)
 
 
 def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from sdfhub.data.store.store import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 
@@ -63,13 +63,13 @@ class Loading:
         seed: of every draw.
     """
 
-    shapes_per_step: int
-    samples_per_shape: int
-    surface_per_shape: int
-    passes_per_epoch: int
-    workers: int
-    augmentation: Augmentation
-    seed: int
+    shapes_per_step: int = 20
+    samples_per_shape: int = 512
+    surface_per_shape: int = 0
+    passes_per_epoch: int = 1
+    workers: int = 0
+    augmentation: Augmentation = Augmentation()
+    seed: int = 0
     resident: bool | None = None
 
     def __post_init__(self):
@@ -105,7 +105,8 @@ class StepBatches(Dataset):
         self.rank, self.world = rank, world
 
     def __len__(self) -> int:
-        return self.steps_per_pass
+        """Steps of an epoch; later ones are there, too."""
+        return self.steps_per_pass * self.loading.passes_per_epoch
 
     def __getitem__(self, step: int) -> Batch:
         rows = self.rows_of(step)

@@ -1,52 +1,181 @@
-"""Prepared shapes as a stream of training batches, with or without loader processes."""
+"""The shapes of a source as a LightningDataModule: prepared, split, and streamed as training batches."""
 
-from collections.abc import Callable, Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import lightning as L
+import torch
 from torch.utils.data import DataLoader, Sampler
 
 from sdfhub.data.loading.batches import Loading, StepBatches
 from sdfhub.data.loading.resident import ResidentBatches
-from sdfhub.data.store.store import StoredShape
+from sdfhub.data.preparation.settings import DEFAULT, Preparation
+from sdfhub.data.sources.source import Source
+from sdfhub.data.splits import Split, split
+from sdfhub.data.store import store as stores
+from sdfhub.data.store.store import Store
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
+
+log = logging.getLogger(__name__)
+
+
+class ValidationShape(NamedTuple):
+    """One shape to be scored while training.
+
+    Args:
+        role: whether it is trained on.
+        row: of the code table; None where it is held out.
+        shape: its samples and mesh.
+    """
+
+    role: Literal["train", "held_out"]
+    row: int | None
+    shape: StoredShape
 
 
 class EpochSteps(Sampler[int]):
-    """The step numbers of one epoch that are still to be done: after a resume, a part of them.
+    """The step numbers of one epoch, from the first that has not been done.
 
-    Lightning's own `set_epoch` comes too early after a resume: it starts again at epoch 0.
+    Lightning ends an epoch by itself, also one that a checkpoint of its middle resumes. Its own `set_epoch`
+    comes too early after a resume: it starts again at epoch 0.
 
     Args:
         steps: steps of an epoch.
-        done: tells how many steps have been done, also after a resume.
+        done: gives how many steps have been done, also after a resume; None counts them here.
     """
 
-    def __init__(self, steps: int, done: Callable[[], int]):
-        self.steps, self.done = steps, done
+    def __init__(self, steps: int, done: Callable[[], int] | None = None):
+        self.steps, self.done, self.counted = steps, done, 0
 
     def __len__(self) -> int:
         return self.steps
 
     def __iter__(self) -> Iterator[int]:
-        done = self.done()
-        return iter(range(done, (done // self.steps + 1) * self.steps))
+        first = self.counted if self.done is None else self.done()
+        self.counted += self.steps
+        return iter(range(first, first + self.steps))
 
 
 class SdfDataModule(L.LightningDataModule):
-    """Prepared shapes as a training stream.
+    """Shapes of a source as training batches, a part of them held out; works with or without a trainer.
+
+    Batches derive from (seed, step): a resumed training sees what an undisturbed one would. In a
+    distributed training give the trainer `use_distributed_sampler=False`; each batch is shared here.
 
     Args:
-        shapes: prepared training shapes, in the order of the code table.
-        loading: how much of them a step and an epoch see.
+        source: where shapes come from.
+        store: folder of prepared samples, shared by all runs.
+        workers: processes that prepare shapes, >= 1; None: one per core.
+        shapes: how many to train on, >= 1; None takes all that are not held out. For a source such as a
+            folder, which has what it has, an upper bound.
+        held_out: how many are never trained on, >= 0; see `splits.split`.
+        split_seed: draws both.
+        preparation: how meshes become samples.
+        loader: what a training step sees.
+        validation_shapes: shapes of each role that `val_dataloader` yields, >= 0.
+
+    Attributes:
+        train_shapes: prepared shapes in the order of the code table, after `setup`.
+        held_out_shapes: prepared shapes, after `setup`.
     """
 
-    def __init__(self, shapes: Sequence[StoredShape], loading: Loading):
+    def __init__(
+        self,
+        source: Source,
+        store: str = "data/store",
+        workers: int | None = None,
+        shapes: int | None = None,
+        held_out: int = 4,
+        split_seed: int = 0,
+        preparation: Preparation = DEFAULT,
+        loader: Loading = Loading(),  # noqa: B008 - frozen
+        validation_shapes: int = 2,
+    ):
         super().__init__()
-        if not shapes:
-            raise SdfhubError("data: every shape that was to be trained on was rejected, as listed above")
-        self.batches = StepBatches(shapes, loading)
-        self.passes_per_epoch, self.workers = loading.passes_per_epoch, loading.workers
-        self.resident = loading.resident
+        numbers = {"workers": (workers, 1), "shapes": (shapes, 1), "held_out": (held_out, 0)}
+        numbers |= {"split_seed": (split_seed, 0), "validation_shapes": (validation_shapes, 0)}
+        for name, (number, least) in numbers.items():
+            if number is not None and number < least:
+                raise SdfhubError(f"data.{name}={number}: must be at least {least}")
+        self.source, self.store, self.workers = source, store, workers
+        self.shapes, self.held_out, self.split_seed = shapes, held_out, split_seed
+        self.preparation, self.loader, self.validation_shapes = preparation, loader, validation_shapes
+        self.train_shapes: list[StoredShape] = []
+        self.held_out_shapes: list[StoredShape] = []
+        self._batches: StepBatches | None = None
+
+    @cached_property
+    def split(self) -> Split:
+        """The source's shapes by role; none is prepared for it."""
+        offered = self.source.shapes()
+        roles = split(offered, self.shapes, self.held_out, self.split_seed, self.source.is_collection)
+        train, held_out = len(roles.train), len(roles.held_out)
+        left_out = len(offered) - train - held_out
+        if self.source.is_collection and (left_out or train != self.shapes or held_out != self.held_out):
+            asked = f"data.shapes={'null' if self.shapes is None else self.shapes}"
+            log.info(
+                f"data: {self.source.label}: of {_counted(len(offered))} {train} are trained on, {held_out} "
+                f"held out, {left_out} left out ({asked} and data.held_out={self.held_out} are upper bounds)"
+            )
+        return roles
+
+    def prepared(self, roles: Split) -> tuple[list[StoredShape], list[StoredShape]]:
+        """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
+        store = self.filled(roles)
+        train, held_out = (
+            [store[s.id] for s in part if s.id in store] for part in (roles.train, roles.held_out)
+        )
+        asked = len(roles.train) + len(roles.held_out)
+        rejected = f" ({_counted(asked)} asked for, {len(store.rejected)} rejected)" if store.rejected else ""
+        name = self.source.name
+        log.info(f"data: {name}: {_counted(len(train))} to train on, {len(held_out)} held out{rejected}")
+        log.info(f"store: {store.folder}: {store.summary()}")
+        return train, held_out
+
+    def filled(self, roles: Split) -> Store:
+        """The store with the shapes of both roles."""
+        shapes = roles.train + roles.held_out
+        return stores.prepare(self.source, shapes, self.preparation, self.store, self.workers)
+
+    def prepare_part(self, part: int, parts: int) -> tuple[int, int]:
+        """Prepares one of so many parts of the shapes, 1 <= part <= parts; processes may share the work so.
+
+        Returns:
+            Shapes of the part, and how many of them were prepared now.
+        """
+        own = (self.split.train + self.split.held_out)[part - 1 :: parts]
+        return len(own), stores.prepare_part(self.source, own, self.preparation, self.store, self.workers)
+
+    def prepare_data(self) -> None:
+        """Fills the store; a second call does nothing.
+
+        Raises:
+            SdfhubError: too few shapes, no usable one, or normals are asked of a source that has none.
+        """
+        self.setup()
+
+    def setup(self, stage: str | None = None) -> None:
+        """Opens the store, filled as `prepare_data` does; a second call does nothing."""
+        if self._batches is not None:
+            return
+        if self.loader.surface_per_shape and not self.source.has_normals:
+            raise SdfhubError(
+                f"normals=on: the files of data={self.source.name} carry none; train with normals=off"
+            )
+        self.train_shapes, self.held_out_shapes = self.prepared(self.split)
+        if not self.train_shapes:
+            raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")
+        self._batches = StepBatches(self.train_shapes, self.loader)
+
+    @property
+    def batches(self) -> StepBatches:
+        """Training batches by step, after `setup`."""
+        if self._batches is None:
+            raise SdfhubError("SdfDataModule: call prepare_data() and setup() first")
+        return self._batches
 
     @property
     def rows(self) -> int:
@@ -55,19 +184,39 @@ class SdfDataModule(L.LightningDataModule):
 
     @property
     def steps_per_epoch(self) -> int:
-        """Training steps of one epoch."""
-        return self.batches.steps_per_pass * self.passes_per_epoch
+        """Training batches of one epoch."""
+        return len(self.batches)
 
     def train_dataloader(self) -> DataLoader:
-        device = self.trainer.strategy.root_device
-        resident = device.type != "cpu" if self.resident is None else self.resident
+        trainer = self.trainer
+        device = trainer.strategy.root_device if trainer else torch.device("cpu")
+        resident = device.type != "cpu" if self.loader.resident is None else self.loader.resident
         if resident and not isinstance(self.batches, ResidentBatches):
-            self.batches = ResidentBatches(self.batches.shapes, self.batches.loading, device)
-        self.batches.share(self.trainer.global_rank, self.trainer.world_size)
+            self._batches = ResidentBatches(self.train_shapes, self.loader, device)
+        if trainer:
+            self.batches.share(trainer.global_rank, trainer.world_size)
         return DataLoader(
             self.batches,
-            sampler=EpochSteps(self.steps_per_epoch, done=lambda: self.trainer.global_step),
+            sampler=EpochSteps(self.steps_per_epoch, self._batches_done if trainer else None),
             batch_size=None,
-            num_workers=0 if resident else self.workers,
+            num_workers=0 if resident else self.loader.workers,
             persistent_workers=False,  # a worker of the last epoch would not hear of the next
         )
+
+    def val_dataloader(self) -> DataLoader:
+        """Yields a few `ValidationShape`, held-out ones first."""
+        count = self.validation_shapes
+        items = [ValidationShape("held_out", None, shape) for shape in self.held_out_shapes[:count]]
+        items += [ValidationShape("train", row, s) for row, s in enumerate(self.train_shapes[:count])]
+        return DataLoader(items, batch_size=None, collate_fn=_unchanged)
+
+    def _batches_done(self) -> int:
+        return self.trainer.global_step * self.trainer.accumulate_grad_batches
+
+
+def _unchanged(item: ValidationShape) -> ValidationShape:
+    return item
+
+
+def _counted(shapes: int) -> str:
+    return f"{shapes} shape" + "s" * (shapes != 1)

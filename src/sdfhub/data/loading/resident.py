@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from sdfhub.data.loading.batches import Loading, StepBatches, batch_of, refuse_empty
-from sdfhub.data.store.shards import COLUMNS
-from sdfhub.data.store.store import StoredShape
+from sdfhub.data.store.stored_shape import COLUMNS, StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 

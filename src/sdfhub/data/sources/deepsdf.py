@@ -11,6 +11,7 @@ import numpy as np
 from sdfhub.data.sources.source import (
     Shape,
     Source,
+    absolute,
     folder_safe,
     name_of_root,
     plain_categories,
@@ -49,6 +50,7 @@ class DeepSdfSource(Source):
     """
 
     has_normals = False
+    is_collection = True
 
     def __init__(
         self,
@@ -57,9 +59,9 @@ class DeepSdfSource(Source):
         train_split: str | None = None,
         test_split: str | None = None,
     ):
-        self.root = Path(root)
+        self.root = Path(absolute(root))
         self.category_of = by_synset(categories)
-        self.train_split, self.test_split = train_split, test_split
+        self.train_split, self.test_split = absolute(train_split), absolute(test_split)
         self.name = name_of_root("deepsdf", self.root)
         self._files: dict[str, Path] = {}
 

@@ -3,11 +3,20 @@
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from sdfhub.data.sources.mesh_files import FORMATS, buffer_path, read_mesh
-from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, name_of_root, unique_ids
+from sdfhub.data.sources.source import (
+    Shape,
+    Source,
+    Triangles,
+    absolute,
+    folder_safe,
+    name_of_root,
+    unique_ids,
+)
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError
 from sdfhub.whole_file import file_sha256
@@ -26,7 +35,10 @@ class FolderSource(Source):
             form of `split_file.with_roles`; None lets a seed decide.
         test_split: the same for held-out shapes. Where either is given, unlisted files are left out.
         up: the axis that points up in the files; only pictures are turned by it.
+        categories: names of first folders, or a mapping of them; others are left out. None or none: all.
     """
+
+    is_collection = True
 
     def __init__(
         self,
@@ -34,11 +46,17 @@ class FolderSource(Source):
         train_split: str | None = None,
         test_split: str | None = None,
         up: Literal["y", "z"] = "y",
+        categories: Mapping[str, Any] | list[str] | None = None,
     ):
-        self.root, self.up = Path(root), up
-        self.train_split, self.test_split = train_split, test_split
+        self.root, self.up = Path(absolute(root)), up
+        self.train_split, self.test_split = absolute(train_split), absolute(test_split)
+        self.categories = [str(name) for name in categories or ()]
         self.name = name_of_root("folder", self.root)
         self._files: dict[str, Path] = {}
+
+    @property
+    def label(self) -> str:
+        return folder_safe(self.root.resolve().name)
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
@@ -47,9 +65,16 @@ class FolderSource(Source):
         self._files = self._by_id()
         if not self._files:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")
+        there = sorted({_category(id) for id in self._files})
+        if missing := [name for name in self.categories if name not in there]:
+            raise SdfhubError(
+                f"category={missing[0]}: data.source.root={self.root} has no folder of that name, but "
+                f"{', '.join(there)}; without category= all are taken"
+            )
         found = [
-            (Shape(id, id.partition("/")[0], _fingerprint(file), credits={"title": _shown(file.name)}), path)
+            (Shape(id, _category(id), _fingerprint(file), credits={"title": _shown(file.name)}), path)
             for id, file in sorted(self._files.items())
+            if not self.categories or _category(id) in self.categories
             for path in [file.relative_to(self.root).with_suffix("").as_posix()]
         ]
         return with_roles(found, self.train_split, self.test_split)
@@ -71,6 +96,10 @@ class FolderSource(Source):
 def _id(path: Path) -> str:
     category, *rest = path.with_suffix("").parts if len(path.parts) > 1 else ("folder", path.stem)
     return f"{folder_safe(category)}/{folder_safe('_'.join(rest))}"
+
+
+def _category(id: str) -> str:
+    return id.partition("/")[0]
 
 
 def _shown(name: str) -> str:

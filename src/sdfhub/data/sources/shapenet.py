@@ -8,6 +8,7 @@ from sdfhub.data.sources.source import (
     Shape,
     Source,
     Triangles,
+    absolute,
     folder_safe,
     name_of_root,
     plain_categories,
@@ -43,8 +44,8 @@ class ShapeNetSource(Source):
         test_split: str | None = None,
     ):
         self.synsets = {name: _synset(name, each) for name, each in plain_categories(categories).items()}
-        self.root = Path(root)
-        self.train_split, self.test_split = train_split, test_split
+        self.root = Path(absolute(root))
+        self.train_split, self.test_split = absolute(train_split), absolute(test_split)
         self.name = name_of_root("shapenet", self.root)
 
     def shapes(self) -> list[Shape]:

@@ -34,7 +34,7 @@ class Shape:
     id: str
     category: str
     fingerprint: str
-    split: Literal["train", "test"] | None = None
+    split: Literal["train", "held_out"] | None = None
     credits: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -48,11 +48,18 @@ class Source(ABC):
         name: folder-safe; the store keeps one folder per name, so it tells two roots apart.
         up: the axis that points up in the source's frame; only pictures are turned by it.
         has_normals: whether its shapes come with surface normals.
+        is_collection: whether it has what it has, so that numbers of shapes asked for are upper bounds.
     """
 
     name: str
     up: Literal["y", "z"] = "y"
     has_normals = True
+    is_collection = False
+
+    @property
+    def label(self) -> str:
+        """What runs and tables may call its shapes."""
+        return self.name
 
     @abstractmethod
     def shapes(self) -> list[Shape]:
@@ -118,6 +125,11 @@ def _digits(path: Path) -> str:
 def name_of_root(kind: str, root: Path) -> str:
     """A source's name that tells two roots apart, such as `folder-scans-1a2b3c`."""
     return f"{kind}-{folder_safe(root.resolve().name)}-{_digits(root.resolve())}"
+
+
+def absolute(path: str | None) -> str | None:
+    """A path that means the same from any folder; None stays None."""
+    return None if path is None else os.path.abspath(path)
 
 
 def state_of(file: Path) -> str:

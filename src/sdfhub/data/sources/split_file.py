@@ -1,12 +1,15 @@
 """Split files: which shapes somebody else trained and tested on."""
 
 import json
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from sdfhub.data.sources.source import Shape
 from sdfhub.errors import SdfhubError
+
+log = logging.getLogger(__name__)
 
 
 def with_roles(
@@ -15,8 +18,8 @@ def with_roles(
     """The shapes that split files list, with their roles; all of them, without roles, where no file is given.
 
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
-    of names, or `{"train": [names], "test": [names]}`, which may be given for both sides. A name is the path
-    of a shape's file, or its last parts, without the suffix.
+    of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
+    name is the path of a shape's file, or its last parts, without the suffix.
 
     Args:
         shapes: each with its path below the source's root, without suffix.
@@ -29,7 +32,7 @@ def with_roles(
     if not train_split and not test_split:
         return [shape for shape, _ in shapes]
     role_of: dict[str, str] = {}
-    for role, file in (("train", train_split), ("test", test_split)):
+    for role, file in (("train", train_split), ("held_out", test_split)):
         listed = _ids_listed(shapes, file, role) if file else []
         both = next((id for id in listed if id in role_of), None)
         if both:
@@ -54,7 +57,7 @@ def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[s
     lost = sorted(name for name in vague if name not in there and paths.isdisjoint(_endings(name)))
     if lost:
         what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
-        print(f"{file}: {what}, such as {lost[0]}", flush=True)
+        log.warning(f"{file}: {what}, such as {lost[0]}")
     return listed
 
 
@@ -66,8 +69,8 @@ def names_listed(file: str, role: str) -> Iterator[str]:
         raise SdfhubError(f"{file}: the {role} split cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise SdfhubError(f"{file}: not JSON: {error}") from error
-    if isinstance(content, dict) and content and content.keys() <= {"train", "test"}:
-        content = content.get(role, [])
+    if isinstance(content, dict) and content and content.keys() <= {"train", "held_out", "test"}:
+        content = content.get(role, content.get("test", []) if role == "held_out" else [])
     try:
         yield from _flattened(content)
     except TypeError as error:

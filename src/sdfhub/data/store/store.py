@@ -1,21 +1,23 @@
 """The store of prepared shapes: samples are made once and mapped into memory ever after.
 
-    root / source name / hash of the preparation / manifest.json
-                                                 / shape id / shape.json, outside.npy, inside.npy, ...
+    root / source name / hash of the preparation / shape id.safetensors
+                                                 / index.json, a cache: which files have been checked
 
-Each shape's folder is written beside its place and renamed. The manifest is an index of their records:
-a start with a thousand shapes reads one file. What the manifest lacks (a run was killed before it wrote
-it) is taken over from the folders.
+Each shape's file is written beside its place and renamed. Files whose size or date have changed since their
+checksum was compared are compared again, and prepared again where they are damaged.
 """
 
 import dataclasses
 import hashlib
 import json
+import logging
 import os
+import re
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -23,50 +25,56 @@ from tqdm import tqdm
 
 from sdfhub.data.preparation.sampling import Preparation, prepare_mesh
 from sdfhub.data.sources.source import Shape, Source
-from sdfhub.data.store import shards
-from sdfhub.data.store.comparison import damaged_shapes, remember
-from sdfhub.data.store.manifest import MANIFEST, VERSION, enter, new_manifest, read_manifest, write_manifest
-from sdfhub.data.store.shards import StoredShape
+from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_of, write_shape
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
-from sdfhub.shapes import ShapeSamples
+from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
+from sdfhub.whole_file import write_whole
 
-PASSING = ("error", "crash")
+log = logging.getLogger(__name__)
+
+VERSION = 3
+"""Of the layout on disk and of how samples are made; stores of another version are not reused."""
+
+INDEX = "index.json"
+
+TRIED_AGAIN = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
+
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{12}")
 
 
 class Store:
     """Prepared shapes of one source under one preparation.
 
     Args:
-        folder: where `manifest.json` lies.
-        manifest: its content.
-        ids: the shapes wanted of it; rejected ones are left out of `ids` and listed in `rejected`.
-        up: the axis that points up in the source's frame, for pictures.
+        folder: of the store.
+        shapes: those wanted of it; the rejected ones are listed in `rejected` alone.
     """
 
-    def __init__(self, folder: Path, manifest: dict, ids: list[str], up: Literal["y", "z"] = "z"):
+    def __init__(self, folder: Path, shapes: Iterable[StoredShape]):
+        shapes = list(shapes)
         self.folder = folder
-        records, rejected = manifest["shapes"], manifest["rejected"]
-        missing = [id for id in ids if id not in records and id not in rejected]
-        if missing:
-            raise SdfhubError(f"{folder}: shape {missing[0]} has not been prepared; run `sdfhub prepare`")
-        self.rejected: dict[str, dict] = {id: rejected[id] for id in ids if id in rejected}
-        self._shapes = {id: StoredShape(id, folder / id, records[id], up) for id in ids if id in records}
+        self.rejected: dict[str, Record] = {shape.id: shape.record for shape in shapes if shape.record.reason}
+        self._shapes = {shape.id: shape for shape in shapes if not shape.record.reason}
 
     @classmethod
-    def open(cls, root: str | Path, ids: list[str] | None = None) -> "Store":
-        """The store whose manifest lies in `root`, limited to `ids`; None takes all it has.
+    def open(cls, root: str | Path, ids: Iterable[str] | None = None) -> "Store":
+        """The store whose files lie in `root`, limited to `ids`; None takes all it has.
 
         Raises:
-            SdfhubError: no readable manifest there, or a shape that was never prepared.
+            SdfhubError: no prepared shapes there, or a shape that was never prepared.
         """
-        manifest = read_manifest(Path(root))
-        if manifest is None:
-            raise SdfhubError(f"{root}: holds no {MANIFEST} of version {VERSION}; run `sdfhub prepare` first")
-        everything = sorted(manifest["shapes"] | manifest["rejected"])
-        return cls(Path(root), manifest, everything if ids is None else list(ids))
+        folder = Path(root)
+        there = _ids_in(folder)
+        if not there:
+            raise SdfhubError(f"{root}: holds no prepared shapes; run `sdfhub prepare` first")
+        ids = there if ids is None else list(ids)
+        shapes = _read(folder, [id for id in ids if id in set(there)])
+        if missing := [id for id in ids if id not in shapes]:
+            raise SdfhubError(f"{folder}: shape {missing[0]} has not been prepared; run `sdfhub prepare`")
+        return cls(folder, shapes.values())
 
     @property
     def ids(self) -> list[str]:
@@ -84,20 +92,20 @@ class Store:
 
     def __getitem__(self, id: str) -> StoredShape:
         if id in self.rejected:
-            raise SdfhubError(f"shape {id} was rejected: {self.rejected[id]['reason']}")
+            raise SdfhubError(f"shape {id} was rejected: {self.rejected[id].reason}")
         if id not in self._shapes:
             raise SdfhubError(f"shape {id} is not among the {len(self)} shapes opened from {self.folder}")
         return self._shapes[id]
 
     def summary(self) -> str:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
-        reasons = Counter(entry["reason"] for entry in self.rejected.values())
-        seconds = sum(shape.seconds for shape in self) / max(1, len(self))
+        reasons = Counter(record.reason for record in self.rejected.values())
+        seconds = sum(shape.record.seconds for shape in self) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
         for reason, count in reasons.most_common():
-            id, entry = next((id, e) for id, e in self.rejected.items() if e["reason"] == reason)
-            lines.append(f"  rejected {count} x {reason}, such as {id} ({entry['detail']})")
+            id, detail = next((id, r.detail) for id, r in self.rejected.items() if r.reason == reason)
+            lines.append(f"  rejected {count} x {reason}, such as {id} ({detail})")
         return "\n".join(lines)
 
 
@@ -111,9 +119,9 @@ def prepare(
 ) -> Store:
     """The store holding `shapes`, preparing those that it lacks.
 
-    A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its files are no
-    longer those that were written: checksums are compared where a size or date has changed. Its randomness
-    derives from its id and fingerprint, so neither the order nor the number of workers matters.
+    A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its file is
+    damaged. Its randomness derives from its id and fingerprint, so neither the order nor the number of
+    workers matters.
 
     Args:
         source: picklable; loads the shapes.
@@ -127,15 +135,23 @@ def prepare(
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
-    manifest = read_manifest(folder) or new_manifest(source.name, preparation)
-    damaged = damaged_shapes(_records(shapes, manifest), folder)
-    if damaged or _missing(shapes, manifest):
-        try:
-            with _locked(folder):
-                manifest = _fill(source, shapes, preparation, folder, workers, progress, damaged)
-        except OSError as error:
-            raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
-    store = Store(folder, manifest, [shape.id for shape in shapes], source.up)
+    stored = _checked(folder, shapes, source)
+    if _left(shapes, stored):
+        with _writing(folder), locked(folder / ".lock", waiting=f"store: {folder}: {_WAITING}"):
+            _remove_leftovers(folder)
+            # another process may have filled it meanwhile
+            left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
+            made: list[str] = []
+            try:
+                for shape, result in _prepared(source, left, preparation, folder, workers, progress):
+                    if isinstance(result, Crashed):
+                        write_shape(_file(folder, shape.id), {}, _rejection(shape, "crash", _CRASH))
+                    made.append(shape.id)
+            finally:  # a run that is interrupted keeps what it has
+                fresh = _read(folder, made, source.up)
+                _remember(folder, fresh, {"source": source.name} | dataclasses.asdict(preparation))
+        stored = _checked(folder, shapes, source)
+    store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
         what = "; ".join(line.strip() for line in store.summary().splitlines())
         raise SdfhubError(f"none of the {len(shapes)} shapes of data={source.name} is usable: {what}")
@@ -152,9 +168,6 @@ def prepare_part(
 ) -> int:
     """Prepares some of a store's shapes; several processes or machines may do so side by side.
 
-    Only the shapes' folders are written: the next call of `prepare` takes them over into the manifest, which
-    costs no more than reading their records.
-
     Args:
         shapes: this part's own; the other arguments are those of `prepare`.
 
@@ -166,15 +179,10 @@ def prepare_part(
         SdfhubError: the store cannot be written.
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
-    try:
-        with _locked(folder, shared=True):
-            _refuse_detours(shapes, folder)
-            manifest = read_manifest(folder) or new_manifest(source.name, preparation)
-            left = _left_after_folders(shapes, manifest, folder)
-            results = _results(source, left, preparation, folder, workers, progress)
-            return sum(not isinstance(record, Crashed) for _, record in results)
-    except OSError as error:
-        raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error
+    with _writing(folder):
+        left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
+        results = _prepared(source, left, preparation, folder, workers, progress)
+        return sum(not isinstance(result, Crashed) for _, result in results)
 
 
 def preparation_hash(preparation: Preparation) -> str:
@@ -189,29 +197,29 @@ def shape_seed(shape: Shape | StoredShape) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def prepare_shape(source: Source, shape: Shape, preparation: Preparation, folder: Path) -> dict:
-    """Loads, samples and writes one shape; returns its record. Never raises for a bad mesh.
+def prepare_shape(source: Source, shape: Shape, preparation: Preparation, folder: Path) -> None:
+    """Loads, samples and writes one shape, or the reason why it is rejected. Never raises for a bad mesh.
 
     Raises:
         OSError: the store cannot be written, which no other shape would survive either.
     """
     start = time.perf_counter()
-    record = {"fingerprint": shape.fingerprint, "category": shape.category, "credits": shape.credits}
+    arrays = {}
     try:
         loaded = source.load(shape)
         is_sampled = isinstance(loaded, ShapeSamples)
         samples = loaded if is_sampled else prepare_mesh(loaded, preparation, shape_seed(shape))
-        arrays = shards.arrays_of(samples, shape_seed(shape))
+        arrays = arrays_of(samples, shape_seed(shape))
+        statistics = {name: float(value) for name, value in samples.statistics.items()}
+        record = Record(shape.fingerprint, shape.category, shape.credits, statistics=statistics)
+        center = tuple(samples.center.tolist())
+        record = dataclasses.replace(record, center=center, scale=float(samples.scale))
     except RejectedMesh as rejection:
-        arrays, refusal = {}, {"reason": rejection.reason, "detail": rejection.detail}
+        record = _rejection(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
-        arrays, refusal = {}, {"reason": "error", "detail": f"{type(error).__name__}: {error}"}
-    else:
-        refusal = None
-        record |= {"center": samples.center.tolist(), "scale": float(samples.scale)}
-        record |= {"statistics": {name: float(value) for name, value in samples.statistics.items()}}
-    record |= {"rejected": refusal, "seconds": round(time.perf_counter() - start, 4)}
-    return shards.write_shape(folder / shape.id, arrays, record)
+        record = _rejection(shape, "error", f"{type(error).__name__}: {error}")
+    seconds = round(time.perf_counter() - start, 4)
+    write_shape(_file(folder, shape.id), arrays, dataclasses.replace(record, seconds=seconds))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,43 +230,20 @@ class _PrepareShape:
     preparation: Preparation
     folder: Path
 
-    def __call__(self, shape: Shape) -> dict:
-        return prepare_shape(self.source, shape, self.preparation, self.folder)
+    def __call__(self, shape: Shape) -> None:
+        prepare_shape(self.source, shape, self.preparation, self.folder)
 
 
-def _fill(source, shapes, preparation, folder, workers, progress, damaged) -> dict:
-    _refuse_detours(shapes, folder)
-    shards.remove_leftovers(folder)
-    manifest = read_manifest(folder) or new_manifest(source.name, preparation)
-    for id in damaged:
-        manifest["shapes"].pop(id, None)
-    left = _left_after_folders(shapes, manifest, folder)
-    try:
-        for index, record in _results(source, left, preparation, folder, workers, progress):
-            is_crash = isinstance(record, Crashed)
-            enter(manifest, left[index].id, _crash_record(left[index]) if is_crash else record)
-    finally:  # a run that is interrupted keeps what it has
-        write_manifest(folder, manifest)
-    remember(_records(shapes, manifest), folder)
-    return manifest
+_WAITING = "waiting for another process that prepares it"
+_CRASH = "the worker process died: out of memory, or a fault in a native library"
 
 
-def _records(shapes: list[Shape], manifest: dict) -> dict[str, dict]:
-    """What the manifest says of those shapes that it keeps, by id."""
-    kept = manifest["shapes"]
-    return {shape.id: kept[shape.id] for shape in shapes if shape.id in kept}
+def _rejection(shape: Shape, reason: str, detail: str) -> Record:
+    detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
+    return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
 
 
-def _left_after_folders(shapes: list[Shape], manifest: dict, folder: Path) -> list[Shape]:
-    """The shapes that neither the manifest nor a folder holds; what folders hold enters the manifest."""
-    for shape in _missing(shapes, manifest):
-        record = shards.read_record(folder / shape.id)
-        if record:
-            enter(manifest, shape.id, record)
-    return _missing(shapes, manifest)
-
-
-def _results(source, left, preparation, folder, workers, progress) -> Iterator[tuple[int, dict | Crashed]]:
+def _prepared(source, left, preparation, folder, workers, progress) -> Iterator[tuple[Shape, Crashed | None]]:
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
     function = _PrepareShape(source, preparation, folder)
     if workers == 1:
@@ -266,37 +251,96 @@ def _results(source, left, preparation, folder, workers, progress) -> Iterator[t
     else:
         results = map_in_processes(function, left, workers)
     quiet = None if progress else True  # None: no bar where nobody watches
-    return iter(tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet))
+    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet)
+    return ((left[index], result) for index, result in bar)
 
 
-def _crash_record(shape: Shape) -> dict:
-    detail = "the worker process died: out of memory, or a fault in a native library"
-    refusal = {"reason": "crash", "detail": detail}
-    return {"fingerprint": shape.fingerprint, "category": shape.category, "rejected": refusal}
-
-
-def _refuse_detours(shapes: list[Shape], folder: Path) -> None:
-    for parent in {(folder / shape.id).parent for shape in shapes}:
-        if not parent.resolve().is_relative_to(folder.resolve()):
-            raise SdfhubError(f"{parent}: leads out of the store; remove that link")
-
-
-def _missing(shapes: list[Shape], manifest: dict) -> list[Shape]:
-    """The shapes without a valid entry in the manifest."""
+def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
+    """The shapes that are not in the store as they are now."""
 
     def is_done(shape: Shape) -> bool:
-        refusal = manifest["rejected"].get(shape.id)
-        entry = refusal or manifest["shapes"].get(shape.id)
-        is_passing = refusal is not None and refusal["reason"] in PASSING
-        return entry is not None and entry["fingerprint"] == shape.fingerprint and not is_passing
+        kept = stored.get(shape.id)
+        return bool(kept and kept.fingerprint == shape.fingerprint and kept.record.reason not in TRIED_AGAIN)
 
     return [shape for shape in shapes if not is_done(shape)]
 
 
+def _file(folder: Path, id: str) -> Path:
+    check_id(id)
+    return folder / f"{id}{SUFFIX}"
+
+
+def _ids_in(folder: Path) -> list[str]:
+    files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
+    paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
+    return sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
+
+
+def _read(
+    folder: Path, ids: Iterable[str], up: Literal["y", "z"] = "z", level: int = logging.WARNING
+) -> dict[str, StoredShape]:
+    """The stored shapes of some ids, in their order, without those that are missing or clearly damaged."""
+    paths = {id: _file(folder, id) for id in ids}
+    for parent in {path.parent for path in paths.values()}:
+        if not parent.resolve().is_relative_to(folder.resolve()):
+            raise SdfhubError(f"{parent}: leads out of the store; remove that link")
+    stored = {}
+    for id, path in paths.items():
+        try:
+            stored[id] = StoredShape(id, path, up)
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError) as error:
+            log.log(level, "store: %s: damaged (%s): to be prepared again", path, error)
+    return stored
+
+
+def _checked(
+    folder: Path, shapes: list[Shape], source: Source, level: int = logging.DEBUG
+) -> dict[str, StoredShape]:
+    """The stored shapes whose files are intact, by id; damage is logged at `level`."""
+    stored = _read(folder, [shape.id for shape in shapes], source.up, level)
+    known = _index(folder).get("checked", {})
+    changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
+    with ThreadPoolExecutor() as pool:  # hashing lets other threads run
+        intact = dict(zip(changed, pool.map(StoredShape.is_intact, changed.values()), strict=True))
+    for id in [id for id, is_intact in intact.items() if not is_intact]:
+        log.log(level, "store: %s: damaged (checksum): to be prepared again", stored.pop(id).path)
+    _remember(folder, {id: stored[id] for id in changed if id in stored})
+    return stored
+
+
+def _index(folder: Path) -> dict:
+    try:
+        index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+        return index if isinstance(index["checked"], dict) else {}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return {}
+
+
+def _remember(folder: Path, intact: dict[str, StoredShape], about: dict | None = None) -> None:
+    """Notes that files are intact, and for a reader what the store was made of."""
+    if intact:
+        index = _index(folder)
+        states = {id: shape.state for id, shape in intact.items()}
+        checked = dict(sorted((index.get("checked", {}) | states).items()))
+        index = {"about": about or index.get("about"), "checked": checked}
+        with suppress(OSError):  # a store that others own is read all the same
+            write_whole(folder / INDEX, json.dumps(index, indent=1))
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Removes the half-written files of runs that were killed more than an hour ago."""
+    for path, _, names in os.walk(folder):
+        for leftover in (Path(path, name) for name in names if _LEFTOVER.fullmatch(name)):
+            if time.time() - leftover.lstat().st_mtime > 3600:
+                leftover.unlink(missing_ok=True)
+
+
 @contextmanager
-def _locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Lets one process at a time fill a store, or several that prepare parts of it (`shared`)."""
-    folder.mkdir(parents=True, exist_ok=True)
-    waiting = f"store: {folder}: waiting for another process that prepares it"
-    with locked(folder / ".lock", shared=shared, waiting=waiting):
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
         yield
+    except OSError as error:
+        raise SdfhubError(f"{folder}: the store cannot be written: {error}") from error

@@ -3,15 +3,14 @@
 import ctypes
 import os
 import shutil
-import time
-import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal
 
 import torch
 import torch._functorch.config as aot
+from pydantic import PositiveInt
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
@@ -50,14 +49,10 @@ class Computing:
             (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
     """
 
-    points_at_once: int | None = None
+    points_at_once: PositiveInt | None = None
     compile: bool | None = None
     tinycudann: bool | None = None
     matmul: Literal["highest", "high", "medium"] | None = None
-
-    def __post_init__(self):
-        if self.points_at_once is not None and self.points_at_once < 1:
-            raise ValueError(f"points_at_once must be at least 1 or null, got {self.points_at_once}")
 
     def threads(self, device: torch.device) -> int:
         """Threads that work on samples of their own: on a CPU all, but what is compiled has one caller."""
@@ -110,36 +105,8 @@ class Computing:
         if not (can_compile(device) if self.compile is None else self.compile):
             return functions
         torch.compiler.reset()
-        fast = [torch.compile(function) for function in functions]
-        if self.compile:
-            return tuple(fast)
-        return tuple(plain_if_broken(*pair) for pair in zip(fast, functions, strict=True))
-
-
-def bfloat16_rate(width: int) -> float:
-    """How fast one thread of this CPU multiplies bfloat16, over how fast it multiplies float32.
-
-    AMX and recent EPYCs come to several times; some Intel processors with AVX512-bf16 alone to about a half,
-    and those with neither to much less. Measured in less than a second, mostly in much less.
-
-    Args:
-        width: of the decoder, in whose layers' products there are as many features in as out.
-    """
-    seconds = {}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as a step multiplies; several would wait for other programs
-    try:
-        for dtype in (torch.bfloat16, torch.float32):
-            left, right = torch.ones(LEAST, width, dtype=dtype), torch.ones(width, width, dtype=dtype)
-            taken = []
-            for _ in range(3):  # the first one also finds its kernel
-                start = time.perf_counter()
-                torch.mm(left, right)
-                taken.append(time.perf_counter() - start)
-            seconds[dtype] = min(taken)
-    finally:
-        torch.set_num_threads(threads)
-    return seconds[torch.float32] / seconds[torch.bfloat16]
+        fast = tuple(torch.compile(function) for function in functions)
+        return fast if self.compile else tuple(map(plain_if_broken, fast))
 
 
 def can_compile(device: torch.device) -> bool:
@@ -148,27 +115,14 @@ def can_compile(device: torch.device) -> bool:
     return device.type == "cuda" and bool(tools)
 
 
-def plain_if_broken(fast: Callable, plain: Callable) -> Callable:
-    """Calls `fast`, and from its first failure on `plain`, whose failure is the caller's.
-
-    The backward pass is compiled with the forward one, so that its failure counts too.
-    """
-    broken = False
+def plain_if_broken(fast: Callable) -> Callable:
+    """A compiled function that PyTorch runs as it is, with a warning, where it does not compile."""
+    import torch._dynamo.config as dynamo  # here: it imports the compiler
 
     def call(*arguments):
-        nonlocal broken
-        if not broken:
-            try:
-                with aot.patch(force_non_lazy_backward_lowering=True):  # later, nobody could go on without
-                    return fast(*arguments)
-            except torch.OutOfMemoryError:
-                raise
-            except Exception as error:
-                broken = True
-                cause = getattr(error, "inner_exception", error)
-                reason = f"{type(cause).__name__}: {str(cause).strip().partition(chr(10))[0]}"
-                warnings.warn(f"computing.compile: goes on without, {reason}", stacklevel=2)
-        return plain(*arguments)
+        # the backward pass is compiled with the forward one: later, nobody could go on without it
+        with aot.patch(force_non_lazy_backward_lowering=True), dynamo.patch(suppress_errors=True):
+            return fast(*arguments)
 
     return call
 

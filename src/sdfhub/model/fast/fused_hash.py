@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from sdfhub.model.encodings import Encoding, Hash, Pullback
+from sdfhub.model.encodings import Encoding, Hash
 
 WIDTHS = (1, 2, 4, 8)
 """Features a level that tiny-cuda-nn has kernels for."""
@@ -68,21 +68,6 @@ class FusedHash(Encoding):
             padded = F.pad(rows.flatten(), (0, -len(rows) % 8 * self.width * (level < self.dense)))
             features.append(functional_call(grid, {"params": padded}, (inside - 0.5 / cells,)))
         return torch.cat(features, dim=-1).unflatten(0, points.shape[:-1])
-
-    @torch.compiler.disable
-    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
-        """As `Hash`, for training: without gradients the pullback serves once."""
-        places = points if points.requires_grad else points.detach().requires_grad_()
-        with torch.enable_grad():
-            features = self(places)
-
-        @torch.compiler.disable
-        def pullback(cotangent: Tensor) -> Tensor:
-            # the one derivative that tiny-cuda-nn differentiates once more
-            differentiable = torch.is_grad_enabled()
-            return torch.autograd.grad(features, places, cotangent, create_graph=differentiable)[0]
-
-        return features, pullback
 
 
 def can_fuse(encoding: Encoding, device: torch.device) -> bool:

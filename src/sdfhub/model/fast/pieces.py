@@ -11,15 +11,12 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from sdfhub.model.fast.dropout import drawn_from
+from sdfhub.model.dropout import drawn_from
 from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.shapes import Batch
 
 Parts = dict[str, Tensor]
 """Weighted terms of the loss by name; their sum is the loss."""
-
-Share = Sequence[Callable[[], Parts]]
-"""Pieces that one thread differentiates, one after the other: what each adds to the parts of the loss."""
 
 
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
@@ -33,16 +30,12 @@ def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
     surface = max(1, batch.surface_points.shape[1])
     together, cuts = max(1, points // samples), -(-samples // points)
     for first in range(0, shapes, together):
-        some = slice(first, first + together)
-        each = [getattr(batch, name)[some].tensor_split(cuts, dim=1) for name in batch.__match_args__[1:]]
-        for columns in zip(*each, strict=True):
-            piece = Batch(batch.rows[some], *columns)
-            part = len(piece.rows) / shapes
-            yield (
-                piece,
-                part * piece.sdf.shape[1] / samples,
-                part * piece.surface_points.shape[1] / surface,
-            )
+        rows = slice(first, first + together)
+        arrays = [getattr(batch, name)[rows].tensor_split(cuts, dim=1) for name in batch.__match_args__[1:]]
+        for columns in zip(*arrays, strict=True):
+            piece = Batch(batch.rows[rows], *columns)
+            share = len(piece.rows) / shapes
+            yield piece, share * piece.sdf.shape[1] / samples, share * piece.surface_points.shape[1] / surface
 
 
 def loss_in_pieces(
@@ -61,7 +54,7 @@ def loss_in_pieces(
         parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.
         batch: to be split.
         points: samples that are worked on together, >= 1.
-        parameters: what the loss is differentiated by; all take part in it.
+        parameters: what the loss is differentiated by.
         threads: each differentiates pieces of its own, >= 1; `parts_of` is called from all of them.
     """
     if batch.sdf.numel() <= points:
@@ -75,21 +68,24 @@ def loss_in_pieces(
 
     cut = list(pieces(batch, points))
     seeds = [None] * len(cut)
-    if batch.sdf.is_cpu:  # here, in order: threads take turns as they like
+    if batch.sdf.is_cpu:  # drawn here, in order: threads take turns as they like
         seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()
-    each = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
+    calls = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
+    shares = [share for thread in range(threads) if (share := calls[thread::threads])]
     totals: Parts = {}
-    return _Summed.apply([each[thread::threads] for thread in range(threads)], totals, *parameters), totals
+    return _Summed.apply(shares, totals, *parameters), totals
 
 
 class _Summed(torch.autograd.Function):
     """The sum of losses, differentiated while it is summed, so that one graph a thread lives at a time."""
 
     @staticmethod
-    def forward(ctx, shares: Sequence[Share], totals: Parts, *parameters: Tensor) -> Tensor:
-        shares = [share for share in shares if share]
-        found = side_by_side(lambda share: _differentiated(share, parameters), shares)
-        (sums, ctx.gradients), *others = found
+    def forward(
+        ctx, shares: Sequence[Sequence[Callable[[], Parts]]], totals: Parts, *parameters: Tensor
+    ) -> Tensor:
+        (sums, ctx.gradients), *others = side_by_side(
+            lambda share: _differentiated(share, parameters), shares
+        )
         totals.update(sums)
         for sums, gradients in others:
             torch._foreach_add_(ctx.gradients, gradients)
@@ -102,8 +98,10 @@ class _Summed(torch.autograd.Function):
         return None, None, *torch._foreach_mul(ctx.gradients, by_loss)
 
 
-def _differentiated(share: Share, parameters: Sequence[Tensor]) -> tuple[Parts, list[Tensor]]:
-    """Sums of the parts of the loss over pieces, and its gradient."""
+def _differentiated(
+    share: Sequence[Callable[[], Parts]], parameters: Sequence[Tensor]
+) -> tuple[Parts, list[Tensor]]:
+    """Sums of the parts of the loss over pieces, and its gradient, one piece after the other."""
     totals: Parts = {}
     gradients: list[Tensor] = []
     for parts_of_piece in share:
@@ -111,11 +109,11 @@ def _differentiated(share: Share, parameters: Sequence[Tensor]) -> tuple[Parts, 
             parts = parts_of_piece()
             loss = torch.stack(tuple(parts.values())).sum()
         with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
-            found = torch.autograd.grad(loss, parameters)
+            by_piece = torch.autograd.grad(loss, parameters, materialize_grads=True)
         if gradients:
-            torch._foreach_add_(gradients, found)
+            torch._foreach_add_(gradients, by_piece)
         else:
-            gradients = list(found)
+            gradients = list(by_piece)
         for name, part in parts.items():
             totals[name] = totals.get(name, 0) + part.detach()
     return totals, gradients

@@ -16,8 +16,8 @@ import torch
 Item, Result = TypeVar("Item"), TypeVar("Result")
 
 _FIRST = Lock()
-"""One thread at a time calls the functions of MKL's vector library for the first time: of two that did so at
-once, one had sines good to a ten-thousandth, once in some hundred processes."""
+"""Threads call the functions of MKL's vector library for the first time in turn: of two that did so at once,
+one had sines good to a ten-thousandth, once in some hundred processes."""
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: int = 2) -> list[Result]:
@@ -39,7 +39,7 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: i
     threads = torch.get_num_threads()
     if threads < 2 or len(items) < least:
         return [work(item) for item in items]
-    call, pool = _in_modes_of_here(work), _pool(threads)
+    call, pool = _in_modes_of_caller(work), _pool(threads)
     futures = [pool.submit(call, item) for item in items]
     try:
         wait(futures, return_when=FIRST_EXCEPTION)
@@ -51,7 +51,7 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: i
     return [future.result() for future in failed or futures]
 
 
-def _in_modes_of_here(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
+def _in_modes_of_caller(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
     """`work` in the modes of the calling thread: threads do not inherit them."""
     gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
     dtype, autocast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
@@ -69,44 +69,23 @@ def _in_modes_of_here(work: Callable[[Item], Result]) -> Callable[[Item], Result
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that each compute alone.
-
-    Raises:
-        RuntimeError: the system has no more of them.
-    """
-    everyone = Barrier(threads + 1)
-    pool = ThreadPoolExecutor(threads, "side_by_side", initializer=_compute_alone, initargs=(everyone,))
-    try:
-        for _ in range(threads):
-            pool.submit(everyone.wait)
-        everyone.wait()
-    except BaseException:  # those that have begun must not wait for the others for ever
-        everyone.abort()
-        pool.shutdown(wait=False)
-        raise
-    finally:
-        torch.set_num_threads(threads)  # the last call anywhere is what later threads begin with
+    """Threads that each compute alone."""
+    started = Barrier(threads + 1, timeout=60)
+    pool = ThreadPoolExecutor(threads, "side_by_side", initializer=_compute_alone)
+    for _ in range(threads):
+        pool.submit(started.wait)  # so that all threads exist before the last line
+    started.wait()
+    torch.set_num_threads(threads)  # the last call in any thread is what later threads begin with
     return pool
 
 
-def _compute_alone(everyone: Barrier) -> None:
-    try:
-        torch.get_num_threads()  # a thread's first call takes the number of others, whatever was set before
-        torch.set_num_threads(1)
-        with _FIRST:
-            for function in (torch.sin, torch.cos, torch.exp, torch.tanh):
-                function(torch.ones(64))
-    except BaseException:
-        everyone.abort()
-        raise
+def _compute_alone() -> None:
+    torch.get_num_threads()  # a thread's first call takes the number of others, whatever was set before
+    torch.set_num_threads(1)
+    with _FIRST:
+        for function in (torch.sin, torch.cos, torch.exp, torch.tanh):
+            function(torch.ones(64))
 
 
-def _begin_anew() -> None:
-    """A forked process has none of the threads, and nobody who would release a lock."""
-    global _FIRST
-    _FIRST = Lock()
-    _pool.cache_clear()
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_begin_anew)
+if hasattr(os, "register_at_fork"):  # not on Windows; a forked process has none of the threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -1,101 +1,148 @@
-"""sin(omega x) and tanh(beta sin(omega x)) on the CPU: one pass over memory forward, one backward.
+"""sin(omega x) and tanh(beta sin(omega x)) in float32 on the CPU: one pass over memory forward, one backward.
+
+As tensor operations an activation and its gradient are some thirty passes, which cost as much as the matrix
+products between them. numba compiles each loop when it is first used (seconds) and keeps it on disk.
 
 Backward recomputes from the product: nothing else is kept. Sines are polynomials fitted by least squares at
 Chebyshev nodes, errors below 1e-6 for angles omega x up to 2e6; beyond 2e7, where float32 numbers lie a
 radian and more apart, sines and the slopes of HOSC are not even bounded. A hyperbolic tangent is a ratio of
-two, of the least largest error and 1 from 9 on: one that kept away from 1 would have slopes where HOSC is
-flat.
+two polynomials with the least largest error, and 1 from 9 on: an approximation that kept away from 1 would
+have slopes where HOSC is flat.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numba
 import numpy as np
 import torch
+from llvmlite import binding
 from torch import Tensor
 
-from sdfhub.model.fast.loops import (
-    FAST,
-    ROWS,
-    chunks,
-    compiled,
-    flat,
-    flat_beside,
-    flat_shift,
-    narrowed,
-    over_points,
-    result_dtype,
-    run,
-    widened,
-)
+from sdfhub.model.activations import Activation, Hosc, Siren
+from sdfhub.model.fast.side_by_side import side_by_side
+
+ROWS = 128
+"""Points of one shape that are added up together: a longer sum of float32 numbers loses digits."""
+
+ALONE = 2**17
+"""Numbers that one thread works through sooner than it wakes another."""
+
+FAST = {"contract", "nsz", "arcp"}
+"""What a compiler may change. Without "nnan" a diverged training shows; "reassoc" would undo careful sums."""
+
+_loop = numba.njit(
+    nogil=True, fastmath=FAST, error_model="numpy", cache=True
+)  # Python's checks each division
+_inlined = numba.njit(inline="always", fastmath=FAST)
+
+_features = binding.get_host_cpu_features()
+if _features.get("avx512f") and not numba.config.CPU_FEATURES:
+    _features["prefer-256-bit"] = False  # LLVM shuns the widest registers; matrix products use them anyway
+    numba.config.CPU_NAME, numba.config.CPU_FEATURES = binding.get_host_cpu_name(), _features.flatten()
 
 _f = np.float32
 _PI, _PI_REST = _f(np.pi), _f(np.pi - np.float64(_f(np.pi)))
 
 
-class Wave(torch.autograd.Function):
-    """[a(product + shift) | beside], and a' where asked for: `Wave.apply(product, shift, log_beta, ...)`.
+def fits(activation: Activation, product: Tensor) -> bool:
+    """Whether the loops compute this activation of this product: a sine or HOSC, in float32 on the CPU."""
+    return (
+        type(activation) in (Siren, Hosc)  # a subclass may be another function
+        and product.is_cpu
+        and product.dtype == torch.float32
+        and product.numel() > 0
+        and not torch.compiler.is_compiling()
+        and not torch.is_autocast_enabled("cpu")
+    )
 
-    Args:
-        product: [B, N, W], such that `fits`.
-        shift: [W] or [B, 1, W] float32.
-        log_beta: logarithm of the sharpness, a scalar tensor; None for a plain sine.
-        beside: [B, N, F], what the next layer reads too, or None: once here, nobody copies a later.
-        omega: frequency factor.
-        plain: x -> a(x), a'(x) as tensor operations, for whoever differentiates the gradient once more.
-        with_slope: whether a' is returned too.
 
-    Returns:
-        [B, N, W + F] with the dtype of `product`, or of autocast, and a' [B, N, W] where asked for.
+def wave(
+    activation: Siren, product: Tensor, shift: Tensor, beside: Tensor | None, sloped: bool
+) -> tuple[Tensor, Tensor | None]:
+    """[a(product + shift) | beside] and a', as `activated` in decoder.py, where the activation `fits`.
+
+    Raises:
+        ValueError: shapes do not fit; a loop would read beyond an array's end.
     """
+    shapes, _, width = product.shape
+    if shift.shape not in ((width,), (shapes, 1, width)):
+        raise ValueError(f"a shift {list(shift.shape)} does not fit products {list(product.shape)}")
+    if beside is not None and beside.shape[:2] != product.shape[:2]:
+        raise ValueError(f"{list(beside.shape)} cannot stand beside products {list(product.shape)}")
+    log_beta = getattr(activation, "log_beta", None)
+    given = product, shift.float(), log_beta, None if beside is None else beside.to(product.dtype)
+    result = _Wave.apply(*given, activation.omega, activation.with_slope, sloped)
+    return result if sloped else (result, None)
 
+
+class _Wave(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, product, shift, log_beta, beside, omega: float, plain: Callable, with_slope: bool):
-        ctx.omega, ctx.plain, ctx.with_slope = omega, plain, with_slope
+    def forward(ctx, product, shift, log_beta, beside, omega: float, plain: Callable, sloped: bool):
+        ctx.omega, ctx.plain = omega, plain
         ctx.save_for_backward(product, shift, log_beta)
         shapes, points, width = product.shape
-        both = width + (0 if beside is None else beside.shape[2])
-        dtype = result_dtype(product)
-        value = product.new_empty(shapes, points, both, dtype=dtype)
-        slope = product.new_empty(product.shape, dtype=dtype) if with_slope else None
-        to_copy = flat_beside(beside, product)
-        results = flat(value), flat(slope) if with_slope else None
-        run(_forward, product, *_given(ctx, product, shift, log_beta), to_copy, *results)
-        return (value, slope) if with_slope else value
+        value = product.new_empty(shapes, points, width + (0 if beside is None else beside.shape[2]))
+        slope = torch.empty_like(product, memory_format=torch.contiguous_format) if sloped else None
+        _run(
+            _forward,
+            product,
+            _given(omega, product, shift, log_beta),
+            _flat(beside),
+            _flat(value),
+            _flat(slope),
+        )
+        return (value, slope) if sloped else value
 
     @staticmethod
     def backward(ctx, by_value, by_slope=None):
         product, shift, log_beta = ctx.saved_tensors
         width = product.shape[2]
         by_beside = by_value[..., width:] if ctx.needs_input_grad[3] else None
-        if torch.is_grad_enabled():
-            of_wave = _differentiable(ctx, by_value[..., :width], by_slope)
-            return *of_wave, by_beside, None, None, None
-        by_product = product.new_empty(product.shape)
-        by_shift, by_log_beta = torch.empty(2, chunks(product), width)
-        cotangents = flat(by_value), None if by_slope is None else flat(by_slope)
-        results = flat(by_product), by_shift.numpy(), by_log_beta.numpy()
-        run(_backward, product, *_given(ctx, product, shift, log_beta), *cotangents, *results)
+        if torch.is_grad_enabled():  # the gradient is to be differentiated again
+            return *_differentiable(ctx, by_value[..., :width], by_slope), by_beside, None, None, None
+        by_product = torch.empty_like(product, memory_format=torch.contiguous_format)
+        by_shift, by_log_beta = torch.empty(2, _chunks(product), width)
+        results = _flat(by_product), by_shift.numpy(), by_log_beta.numpy()
+        given = _given(ctx.omega, product, shift, log_beta)
+        _run(_backward, product, given, _flat(by_value), _flat(by_slope), *results)
+        by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
         by_log_beta = None if log_beta is None else by_log_beta.sum()
-        return by_product, over_points(by_shift, shift), by_log_beta, by_beside, None, None, None
-
-
-def _given(ctx, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
-    beta = None if log_beta is None else _f(log_beta.exp().item())
-    return flat(product), flat_shift(shift, product), product.shape[1], _f(ctx.omega), beta
+        return by_product, by_shift, by_log_beta, by_beside, None, None, None
 
 
 def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tensor | None]:
-    outputs = ctx.plain(ctx.saved_tensors[0] + ctx.saved_tensors[1])
-    cotangents = [by_value, by_slope][: 1 + ctx.with_slope]
-    outputs = [out.to(by.dtype) for out, by in zip(outputs, cotangents, strict=False)]
-    wanted = [tensor is not None and tensor.requires_grad for tensor in ctx.saved_tensors]
-    inputs = [tensor for tensor, is_wanted in zip(ctx.saved_tensors, wanted, strict=True) if is_wanted]
-    found = iter(torch.autograd.grad(outputs, inputs, cotangents, create_graph=True))
-    return [next(found) if is_wanted else None for is_wanted in wanted]
+    product, shift, _ = ctx.saved_tensors
+    pairs = zip(ctx.plain(product + shift), (by_value, by_slope), strict=True)
+    outputs, cotangents = zip(*[pair for pair in pairs if pair[1] is not None], strict=True)
+    wanted = [tensor for tensor in ctx.saved_tensors if tensor is not None and tensor.requires_grad]
+    gradients = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True))
+    return [next(gradients) if any(tensor is one for one in wanted) else None for tensor in ctx.saved_tensors]
 
 
-@numba.njit(inline="always", fastmath=FAST)
+def _given(omega: float, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
+    beta = None if log_beta is None else _f(log_beta.exp().item())
+    return _flat(product), _flat(shift), product.shape[1], _f(omega), beta
+
+
+def _flat(tensor: Tensor | None) -> np.ndarray | None:
+    """[rows, W] of the same memory."""
+    return None if tensor is None else tensor.detach().contiguous().view(-1, tensor.shape[-1]).numpy()
+
+
+def _chunks(product: Tensor) -> int:
+    """How many parts of at most ROWS points of one shape a product [B, N, W] has."""
+    return product.shape[0] * -(-product.shape[1] // ROWS)
+
+
+def _run(kernel: Callable, product: Tensor, given: tuple, *arrays) -> None:
+    """Runs a loop over the chunks of a product, on as many threads as PyTorch has."""
+    count, threads = _chunks(product), torch.get_num_threads() if product.numel() > ALONE else 1
+    ends = [count * part // threads for part in range(threads + 1)]
+    side_by_side(lambda chunks: kernel(*chunks, *given, *arrays), list(pairwise(ends)))
+
+
+@_inlined
 def _sin_cos(angle):
     half_turns = np.rint(angle * _f(1 / np.pi))
     rest = (angle - half_turns * _PI) - half_turns * _PI_REST  # in [-pi/2, pi/2]
@@ -108,7 +155,7 @@ def _sin_cos(angle):
     return sine * sign, cosine * sign
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@_inlined
 def _tanh(x):
     x = min(max(x, _f(-9)), _f(9))
     s = x * x
@@ -118,47 +165,53 @@ def _tanh(x):
     return x * over / (_f(1) + s * (_f(0.4669068) + s * under))
 
 
-@compiled
-def _forward(some, product, shift, points, omega, beta, beside, value, slope):
+@_inlined
+def _rows(chunk, points):
+    """The shape of a chunk, and its first row and the one after its last."""
     per_shape = -(-points // ROWS)
-    for chunk in range(some[0], some[1]):
-        shape, part = chunk // per_shape, chunk % per_shape
+    shape, part = chunk // per_shape, chunk % per_shape
+    return shape, shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)
+
+
+@_loop
+def _forward(first, end, product, shift, points, omega, beta, beside, value, slope):
+    for chunk in range(first, end):
+        shape, low, high = _rows(chunk, points)
         line = shape if len(shift) > 1 else 0
-        for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
+        for p in range(low, high):
             for j in range(product.shape[1]):
-                sine, cosine = _sin_cos(omega * (widened(product[p, j]) + shift[line, j]))
+                sine, cosine = _sin_cos(omega * (product[p, j] + shift[line, j]))
                 a, d = sine, omega * cosine
                 if beta is not None:
                     a = _tanh(beta * sine)
                     d = beta * d * (_f(1) - a * a)
-                value[p, j] = narrowed(a, value[p, j])
+                value[p, j] = a
                 if slope is not None:
-                    slope[p, j] = narrowed(d, slope[p, j])
+                    slope[p, j] = d
             if beside is not None:
                 for j in range(beside.shape[1]):
                     value[p, product.shape[1] + j] = beside[p, j]
 
 
-@compiled
+@_loop
 def _backward(
-    some, product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta
+    first, end, product, shift, points, omega, beta, by_value, by_slope, by_product, by_shift, by_log_beta
 ):
     # With u = beta sin(omega x), v = u', a = tanh(u) and d = 1 - a^2:
     # a' = d v, a'' = -d (omega^2 u + 2 a v^2); by log beta, a grows as d u and a' as d (v - 2 a v u).
-    per_shape = -(-points // ROWS)
-    for chunk in range(some[0], some[1]):
-        shape, part = chunk // per_shape, chunk % per_shape
+    for chunk in range(first, end):
+        shape, low, high = _rows(chunk, points)
         line = shape if len(shift) > 1 else 0
         by_shift[chunk], by_log_beta[chunk] = 0, 0
-        for p in range(shape * points + part * ROWS, shape * points + min(points, (part + 1) * ROWS)):
+        for p in range(low, high):
             for j in range(product.shape[1]):
-                u, cosine = _sin_cos(omega * (widened(product[p, j]) + shift[line, j]))
+                u, cosine = _sin_cos(omega * (product[p, j] + shift[line, j]))
                 v = omega * cosine
-                g = widened(by_value[p, j])
+                g = by_value[p, j]
                 if beta is None:
                     by_x = g * v
                     if by_slope is not None:
-                        by_x -= widened(by_slope[p, j]) * omega * omega * u
+                        by_x -= by_slope[p, j] * omega * omega * u
                 else:
                     u, v = beta * u, beta * v
                     a = _tanh(u)
@@ -166,8 +219,8 @@ def _backward(
                     by_x = d * g * v
                     by_log_beta[chunk, j] += d * g * u
                     if by_slope is not None:
-                        by_v, bent = d * widened(by_slope[p, j]), _f(2) * a * v
+                        by_v, bent = d * by_slope[p, j], _f(2) * a * v
                         by_x -= by_v * (bent * v + omega * omega * u)
                         by_log_beta[chunk, j] += by_v * (v - bent * u)
-                by_product[p, j] = narrowed(by_x, by_product[p, j])
+                by_product[p, j] = by_x
                 by_shift[chunk, j] += by_x

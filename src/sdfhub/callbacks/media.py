@@ -1,0 +1,103 @@
+"""Pictures and meshes for loggers, each of which shows them as it can.
+
+A logger of your own joins with a line for either: `show_picture.register(MyLogger)(my_show_picture)`, where
+`my_show_picture` takes the same arguments. Loggers without such a line show nothing.
+"""
+
+import tempfile
+from functools import singledispatch
+from pathlib import Path
+from typing import Literal
+
+import fast_simplification
+import numpy as np
+import torch
+from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from PIL import Image
+
+from sdfhub.geometry.mesh_file import write_row
+
+TENSORBOARD_VERTICES = 60_000
+"""TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""
+
+
+@singledispatch
+def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> None:
+    """Shows a picture in a logger.
+
+    Args:
+        logger: one of the trainer's.
+        name: of the picture, the same at every step; parts are separated by "/".
+        image: [H, W, 3] uint8.
+        step: of the training.
+    """
+
+
+@singledispatch
+def show_mesh(
+    logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: Literal["y", "z"], step: int
+) -> None:
+    """Shows a mesh upright in a logger.
+
+    Args:
+        logger, name, step: as for `show_picture`.
+        vertices: [V, 3], normalised frame.
+        faces: [F, 3], F > 0.
+        up: the axis of the mesh that points up.
+    """
+
+
+@show_picture.register
+def _(logger: TensorBoardLogger, name, image, step):
+    logger.experiment.add_image(name, image, step, dataformats="HWC")
+
+
+@show_mesh.register
+def _(logger: TensorBoardLogger, name, vertices, faces, up, step):
+    if len(vertices) > TENSORBOARD_VERTICES:
+        share = 1 - TENSORBOARD_VERTICES / len(vertices)
+        vertices, faces = fast_simplification.simplify(vertices.astype(np.float32), faces, share)
+    if up == "z":  # TensorBoard has y up
+        vertices = vertices[:, [0, 2, 1]] * [1, 1, -1]
+    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+    logger.experiment.add_mesh(
+        name, torch.from_numpy(vertices)[None], faces=torch.from_numpy(faces)[None], global_step=step
+    )
+
+
+@show_picture.register
+def _(logger: CSVLogger, name, image, step):
+    path = Path(logger.log_dir) / name / f"{step:08d}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path)
+
+
+@show_mesh.register
+def _(logger: CSVLogger, name, vertices, faces, up, step):
+    write_row([(vertices, faces)], up, Path(logger.log_dir) / name / f"{step:08d}.glb")
+
+
+@show_picture.register
+def _(logger: WandbLogger, name, image, step):
+    logger.log_image(name, [image], step)
+
+
+@show_mesh.register
+def _(logger: WandbLogger, name, vertices, faces, up, step):
+    import wandb  # an extra
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_row([(vertices, faces)], up, path := Path(folder) / "mesh.glb")
+        logger.log_metrics({name: wandb.Object3D(str(path))}, step)  # copies the file
+
+
+@show_picture.register
+def _(logger: MLFlowLogger, name, image, step):
+    logger.experiment.log_image(logger.run_id, image, artifact_file=f"{name}/{step:08d}.png")
+
+
+@show_mesh.register
+def _(logger: MLFlowLogger, name, vertices, faces, up, step):
+    with tempfile.TemporaryDirectory() as folder:
+        write_row([(vertices, faces)], up, path := Path(folder) / f"{step:08d}.glb")
+        logger.experiment.log_artifact(logger.run_id, str(path), artifact_path=name)

@@ -1,0 +1,91 @@
+"""A composed config as objects and as plain data. Whatever the user's own config names is made."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from omegaconf.resolvers import oc
+
+import sdfhub
+from sdfhub.described import RESERVED, check_arguments, located
+from sdfhub.errors import SdfhubError
+
+
+def configuration_folder() -> Path:
+    """The folder of YAMLs: inside an installed package, beside `src/` in a checkout."""
+    package = Path(sdfhub.__file__).resolve().parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parents[1] / "conf"
+
+
+def one_line(error: BaseException) -> str:
+    """What a user needs of an error: what is wrong, in one line."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
+    if isinstance(error, MemoryError):
+        return f"out of memory: {error}; lower resolution, points or samples"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)) or type(
+        error
+    ).__name__
+
+
+def instantiate(config: Any, key: str, **given: Any) -> Any:
+    """The object that a node of the user's own config describes: `hydra.utils.instantiate`, checked before.
+
+    Args:
+        config: a node with `_target_`, or a mapping or list of such; None stays None.
+        key: where it stands in the config, for messages.
+        given: arguments that come from code.
+
+    Raises:
+        SdfhubError: no such class or argument, a value of the wrong type, or what the class says of it.
+    """
+    node = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    _check(node, key, given)
+    try:
+        return hydra.utils.instantiate(node, _convert_="all", **given)
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, SdfhubError | KeyboardInterrupt):
+            raise cause from error
+        raise SdfhubError(f"{key}: {one_line(cause)}") from error
+
+
+def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:
+    if isinstance(node, list):
+        for number, item in enumerate(node):
+            _check(item, f"{key}.{number}")
+    if not isinstance(node, Mapping):
+        return
+    for name, value in node.items():
+        _check(value, f"{key}.{name}")
+    if "_target_" in node and "_args_" not in node:
+        arguments = {name: value for name, value in node.items() if name not in RESERVED}
+        check_arguments(located(node["_target_"], key), {**arguments, **(given or {})}, key)
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A config as plain data with its interpolations resolved, but `${oc.env:NAME}` as it is written.
+
+    The environment holds keys and passwords; a run's config is written down and passed on.
+    """
+    written = lambda *words: "${oc.env:" + ",".join(map(str, words)) + "}"  # noqa: E731
+    OmegaConf.register_new_resolver("oc.env", written, replace=True)
+    try:
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    finally:
+        OmegaConf.register_new_resolver("oc.env", oc.env, replace=True)
+
+
+def with_absolute_paths(node: Any) -> Any:
+    """Plain data in which relative paths of what is there are absolute, so that they hold from anywhere."""
+    if isinstance(node, Mapping):
+        return {name: with_absolute_paths(value) for name, value in node.items()}
+    if isinstance(node, str) and "/" in node and not Path(node).is_absolute() and Path(node).exists():
+        return str(Path(node).absolute())
+    return node

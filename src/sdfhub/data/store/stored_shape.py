@@ -1,0 +1,253 @@
+"""One prepared shape: one safetensors file of sample rows and the mesh, there whole or not at all.
+
+The file's metadata holds a `Record`, which also says why a shape was rejected; then there are no arrays.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, BinaryIO, ClassVar, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter
+
+from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
+from sdfhub.whole_file import whole_file
+
+SUFFIX = ".safetensors"
+
+COLUMNS = {"vertices": 3, "outside": 4, "inside": 4, "surface": 6, "faces": 3}
+"""Columns of each array, in their order in a file: position, (x, y, z, sdf) twice, (point, normal), vertex
+indices. The one of 8 bytes a number comes first, so that all are aligned."""
+
+DTYPES = {"vertices": "<f8", "outside": "<f4", "inside": "<f4", "surface": "<f4", "faces": "<i4"}
+_SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
+_MAX_HEADER = 1 << 20
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of a prepared or rejected shape.
+
+    Args:
+        fingerprint, category, credits: as the source gave them.
+        seconds: what loading and preparing took.
+        center: source units; `source = normalised / scale + center`.
+        scale: normalised units per source unit.
+        statistics: plain numbers about the preparation.
+        reason: why the shape was rejected; None where it was not.
+        detail: of the rejection.
+        sha256: of all else in the file.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
+
+    fingerprint: str
+    category: str
+    credits: dict[str, str]
+    seconds: float = 0.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    statistics: dict[str, float] = field(default_factory=dict)
+    reason: str | None = None
+    detail: str = ""
+    sha256: str = ""
+
+
+_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
+
+
+def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
+    """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
+    rng = np.random.default_rng(seed)
+    rows = np.column_stack([samples.points, samples.sdf])
+    surface = np.column_stack([samples.surface_points, samples.surface_normals])
+    inside = samples.sdf < 0
+    arrays = {
+        "outside": rng.permutation(rows[~inside]),
+        "inside": rng.permutation(rows[inside]),
+        "surface": rng.permutation(surface),
+    }
+    if samples.mesh is not None:
+        arrays |= {"vertices": samples.mesh.vertices, "faces": samples.mesh.faces}
+    return {name: np.ascontiguousarray(array, dtype=DTYPES[name]) for name, array in arrays.items()}
+
+
+def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) -> None:
+    """Writes one shape's file.
+
+    Args:
+        path: what lies there is replaced.
+        arrays: as `arrays_of` makes them; empty for a rejected shape.
+        record: its `sha256` is filled in.
+    """
+    arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
+    header = _header({name: len(array) for name, array in arrays.items()})
+    digest = _digest(record, header)
+    for array in arrays.values():
+        digest.update(array.data)
+    record = dataclasses.replace(record, sha256=digest.hexdigest())
+    metadata = {"__metadata__": {"record": json.dumps(dataclasses.asdict(record))}}
+    text = json.dumps(metadata | header).encode()
+    text += b" " * (-len(text) % 8)
+    with whole_file(path) as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for array in arrays.values():
+            file.write(array.data)
+
+
+def _header(rows: Mapping[str, int]) -> dict[str, dict]:
+    """What a safetensors file says of arrays with so many rows that lie one after the other."""
+    header, end = {}, 0
+    for name, count in rows.items():
+        start, end = end, end + count * COLUMNS[name] * np.dtype(DTYPES[name]).itemsize
+        dtype = _SAFETENSORS_NAMES[DTYPES[name]]
+        header[name] = {"dtype": dtype, "shape": [count, COLUMNS[name]], "data_offsets": [start, end]}
+    return header
+
+
+def _digest(record: Record, header: Mapping[str, dict]) -> "hashlib._Hash":
+    """A sha256 that has taken in all of a file but the arrays' numbers."""
+    content = [dataclasses.asdict(record) | {"sha256": ""}, header]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+
+
+class StoredShape:
+    """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
+
+    Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
+    open would count as this process's memory until they were the whole store.
+
+    Args:
+        id: as the source gave it.
+        path: of its file; links are not followed.
+        up: the axis that points up in the source's frame, for pictures.
+
+    Attributes:
+        record: all that is known of the shape; `record.reason` is set where it was rejected.
+        center: [3] float64, source units; `source = normalised / scale + center`.
+        scale: normalised units per source unit.
+        state: changes when the file is written anew.
+
+    Raises:
+        OSError: the file cannot be opened.
+        ValueError: its header is damaged, or it is shorter or longer than the header says.
+    """
+
+    def __init__(self, id: str, path: Path, up: Literal["y", "z"] = "z"):
+        self.id, self.path, self.up = id, path, up
+        with self._open() as file:
+            status = os.fstat(file.fileno())
+            self.state = f"{status.st_size} {status.st_mtime_ns}"
+            length = int.from_bytes(file.read(8), "little")
+            if length > min(status.st_size, _MAX_HEADER):
+                raise ValueError("its header is damaged")
+            text = file.read(length)
+        try:
+            found = json.loads(text)
+            self.record = _RECORD.validate_json(found.pop("__metadata__")["record"])
+            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in found.items()}
+            header = _header(self._rows)
+            is_ours = found == header and all(type(rows) is int and rows >= 0 for rows in self._rows.values())
+        except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
+            raise ValueError(f"its header is damaged: {error!r}") from error
+        if not is_ours:
+            raise ValueError("its header is damaged")
+        self._start, self._size = 8 + length, status.st_size
+        self._offsets = {name: self._start + entry["data_offsets"][0] for name, entry in header.items()}
+        size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
+        if size != self._size:
+            raise ValueError(f"it has {self._size} bytes, not {size}")
+        self.category, self.fingerprint = self.record.category, self.record.fingerprint
+        self.credits, self.scale = self.record.credits, self.record.scale
+        self.center = np.array(self.record.center, dtype=np.float64)
+
+    @property
+    def outside(self) -> np.ndarray:
+        """[n, 4] float32 rows (x, y, z, sdf) with sdf >= 0, shuffled."""
+        return self._map("outside")
+
+    @property
+    def inside(self) -> np.ndarray:
+        """[n, 4] float32 rows (x, y, z, sdf) with sdf < 0, shuffled."""
+        return self._map("inside")
+
+    @property
+    def surface(self) -> np.ndarray:
+        """[M, 6] float32 rows (point, outward unit normal), shuffled; M = 0 where there are none."""
+        return self._map("surface")
+
+    @property
+    def mesh(self) -> NormalizedMesh | None:
+        """The oriented mesh behind the samples, read into memory; None where the source has none."""
+        if "faces" not in self._rows:
+            return None
+        vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
+        return NormalizedMesh(vertices, faces, Frame(self.center, self.scale))
+
+    def rows(self, name: str) -> int:
+        """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
+        return self._rows.get(name, 0)
+
+    def read(self, name: str, start: int, count: int) -> np.ndarray:
+        """`count` rows [count, C] of an array from row `start` on; after the last comes the first."""
+        rows = np.empty((count, COLUMNS[name]), DTYPES[name])
+        self.read_into(rows, name, start)
+        return rows
+
+    def read_into(self, rows: np.ndarray, name: str, start: int) -> None:
+        """Fills `rows` [n, C], contiguous, with those of an array from row `start` on, as `read` does."""
+        if not len(rows):
+            return
+        start %= self.rows(name)
+        try:
+            with self._open() as file:
+                self._refuse_other_size(file)
+                while len(rows):
+                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                    file.seek(self._offsets[name] + start * part.strides[0])
+                    file.readinto(part.data.cast("B"))
+                    start = 0
+        except (OSError, ValueError) as error:
+            raise self._broken(error) from error
+
+    def is_intact(self) -> bool:
+        """Whether the file's content still has its sha256; reads all of it."""
+        try:
+            with self._open() as file:
+                file.seek(self._start)
+                digest = hashlib.file_digest(file, lambda: _digest(self.record, _header(self._rows)))
+            return digest.hexdigest() == self.record.sha256
+        except OSError:
+            return False
+
+    def _open(self) -> BinaryIO:
+        return open(self.path, "rb", opener=_without_links)
+
+    def _map(self, name: str) -> np.ndarray:
+        shape = (self.rows(name), COLUMNS[name])
+        if not shape[0]:  # an empty file cannot be mapped
+            return np.zeros(shape, dtype=DTYPES[name])
+        try:
+            with self._open() as file:
+                self._refuse_other_size(file)
+                return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
+        except (OSError, ValueError) as error:
+            raise self._broken(error) from error
+
+    def _refuse_other_size(self, file: BinaryIO) -> None:
+        if (size := os.fstat(file.fileno()).st_size) != self._size:
+            raise ValueError(f"it has {size} bytes, not {self._size}")
+
+    def _broken(self, error: Exception) -> SdfhubError:
+        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
+        return SdfhubError(f"{self.path}: {why}; start or prepare again: damaged shapes are prepared anew")
+
+
+def _without_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))

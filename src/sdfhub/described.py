@@ -1,0 +1,204 @@
+"""Objects as plain data and back: what a checkpoint, an export and a config say of a model.
+
+A description is a mapping with `_target_`, the dotted path of a class, and the arguments of its constructor,
+as in a Hydra config; `_partial_` marks a factory. `describe` writes one, `built` makes the object of one that
+comes from a file: only classes of sdfhub and of packages that the caller trusts are imported for it.
+"""
+
+import dataclasses
+import functools
+import importlib
+import inspect
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from sdfhub.errors import SdfhubError
+
+OF_PYTORCH = ("torch.nn.", "torch.optim.")
+"""Layers and optimisers of PyTorch are built from a file too: they do nothing but compute."""
+
+RESERVED = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
+"""Keys of a description that are no arguments."""
+
+
+class Described:
+    """An object that remembers the arguments of its constructor, so that `describe` can write them down."""
+
+    def __init_subclass__(cls, **settings: Any):
+        super().__init_subclass__(**settings)
+        if "__init__" in vars(cls):
+            cls.__init__ = _remembering(cls.__init__)
+
+
+def _remembering(initialise: Callable) -> Callable:
+    signature = inspect.signature(initialise)
+
+    @functools.wraps(initialise)
+    def remember(self, *arguments: Any, **named: Any) -> None:
+        if "_arguments" not in self.__dict__:  # else the constructor of a class below this one came first
+            bound = signature.bind(self, *arguments, **named).arguments
+            self.__dict__["_arguments"] = dict(list(bound.items())[1:])
+        initialise(self, *arguments, **named)
+
+    return remember
+
+
+def describe(value: Any, key: str = "") -> Any:
+    """An object as plain data: numbers, strings, lists and mappings.
+
+    Args:
+        value: plain data, a class, a `functools.partial`, a dataclass or a `Described`, nested at will.
+        key: what the value is, for messages.
+
+    Raises:
+        SdfhubError: an object that cannot say how it was made.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): describe(item, f"{key}.{name}") for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [describe(item, key) for item in value]
+    if isinstance(value, functools.partial) and not value.args:
+        return {"_target_": _path(value.func), "_partial_": True, **describe(value.keywords, key)}
+    if inspect.isclass(value) or inspect.isfunction(value):
+        return {"_target_": _path(value), "_partial_": True}
+    if dataclasses.is_dataclass(value):
+        arguments = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+    elif isinstance(value, Described):
+        arguments = vars(value).get("_arguments", {})
+    else:
+        what = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise SdfhubError(f"{key}: {what} cannot say how it was made; derive it from sdfhub's own class")
+    return {"_target_": _path(type(value)), **describe(arguments, key)}
+
+
+def _path(kind: Callable) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "sdfhub") -> Any:
+    """The object of a description that comes from a file.
+
+    Args:
+        node: plain data; mappings with `_target_` become objects, wherever they stand.
+        key: what the description is of, for messages.
+        trust: packages beside sdfhub whose classes may be built.
+        within: the package of sdfhub that the classes belong to.
+
+    Raises:
+        SdfhubError: a class of another package, an unknown or missing argument, a value of a wrong type.
+    """
+    if isinstance(node, list):
+        return [built(item, key, trust, within) for item in node]
+    if not isinstance(node, Mapping):
+        return node
+    arguments = {
+        name: built(value, f"{key}.{name}", trust, within)
+        for name, value in node.items()
+        if name not in RESERVED
+    }
+    if "_target_" not in node:
+        return arguments
+    target = _trusted(node["_target_"], key, trusted_packages(trust), within)
+    check_arguments(target, arguments, key)
+    if node.get("_partial_"):
+        return functools.partial(target, **arguments)
+    try:
+        return target(**arguments)
+    except (TypeError, ValueError) as error:
+        raise SdfhubError(f"{key}: {error}") from error
+
+
+def trusted_packages(trust: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The names of trusted packages from one name, several, or text such as `mypkg,other`."""
+    names = trust.split(",") if isinstance(trust, str) else list(trust or ())
+    return tuple(name.strip() for name in names if name.strip())
+
+
+def _trusted(path: Any, key: str, trust: tuple[str, ...], within: str) -> Callable:
+    package = path.partition(".")[0] if isinstance(path, str) else ""
+    ours = (f"{within}.", *OF_PYTORCH)
+    if package not in trust and not str(path).startswith(ours):
+        hint = f"; trust={package} builds it, if you know that package" if package.isidentifier() else ""
+        raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}{hint}")
+    target = located(path, key)
+    if package not in trust and not (inspect.isclass(target) and target.__module__.startswith(ours)):
+        raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}")
+    return target
+
+
+def located(path: str, key: str) -> Callable:
+    """The class or function of a dotted path.
+
+    Raises:
+        SdfhubError: there is none; says why it cannot be imported.
+    """
+    parts, reason = str(path).split("."), "no such module"
+    for end in range(len(parts) - 1, 0, -1):
+        try:
+            target = importlib.import_module(".".join(parts[:end]))
+        except ImportError as error:
+            reason = str(error)
+            continue
+        for name in parts[end:]:
+            target = getattr(target, name, None)
+        if callable(target):
+            return target
+        reason = f"{'.'.join(parts[:end])} has none"
+        break
+    raise SdfhubError(f"{key}: there is no class {path} ({reason}); is its package on the Python path?")
+
+
+def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) -> None:
+    """Refuses arguments that a class or function does not take, or of another type than it annotates.
+
+    Raises:
+        SdfhubError: names the argument, its value and what is wanted.
+    """
+    try:
+        signature = inspect.signature(target).parameters
+    except (TypeError, ValueError):  # a class that is compiled
+        return
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.values())
+    hints = _hints(target)
+    for name, value in arguments.items():
+        if name not in signature and not takes_any:
+            known = ", ".join(signature) or "no arguments"
+            raise SdfhubError(f"{key}.{name}: no such setting; {target.__name__} takes {known}")
+        if name in hints and (value is None or isinstance(value, bool | int | float | str | list)):
+            check(value, hints[name], f"{key}.{name}")
+
+
+def _hints(target: Callable) -> dict[str, Any]:
+    if target.__module__.partition(".")[0] in ("lightning", "torch"):
+        return {}  # they check their own arguments
+    is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
+    try:
+        return typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
+    except Exception:  # an annotation that cannot be read at run time checks nothing
+        return {}
+
+
+def check(value: Any, hint: Any, key: str) -> Any:
+    """The value as its annotation wants it; an int where a float is due is one.
+
+    Raises:
+        SdfhubError: it is no such value.
+    """
+    try:
+        lenient = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+        adapter = TypeAdapter(hint, config=lenient)
+    except Exception:  # pydantic knows no such annotation
+        return value
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        wanted = dict.fromkeys(problem["msg"].lower().removeprefix("input ") for problem in error.errors())
+        raise SdfhubError(f"{key}={value!r}: {' or '.join(wanted)}") from error

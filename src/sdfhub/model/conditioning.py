@@ -1,0 +1,128 @@
+"""How a code enters the decoder's layers; rivals share one signature.
+
+A layer is affine in its inputs: product + shift, where the product is linear in [hidden | encoding]. A rival
+needs `forward` alone; `pullback` is autograd's by default.
+"""
+
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from sdfhub.described import Described
+from sdfhub.model.derivatives import value_and_pullback
+
+Cotangents = tuple[Tensor | None, Tensor | None]
+"""Of hidden [B, N, H] and of encoding [B, N, F]; None for a part that a layer does not read."""
+
+
+def full_precision(like: Tensor) -> AbstractContextManager:
+    """Keeps autocast, where there is any on the device of `like`, off what is computed inside."""
+    device = like.device.type
+    # torch.export must write down every region, and cannot write one inside another
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+
+
+class Layer(Described, nn.Module, ABC):
+    """A linear layer over [hidden | encoding], steered by a code; it holds the weights of `linear`.
+
+    Args:
+        hidden, encoding: number of input columns of each part; 0 leaves the part out.
+        code: L, numbers in the code; 0 leaves the layer unconditioned.
+        outputs: W, number of output features.
+
+    Attributes:
+        joins_code: whether the code's numbers are columns of `linear`, so that a layer before has to make
+            room for them where layers are shortened.
+    """
+
+    joins_code = False
+
+    def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
+        super().__init__()
+        self.columns = [hidden, encoding, code if self.joins_code else 0]
+        self.linear = nn.Linear(sum(self.columns), outputs)
+
+    @abstractmethod
+    def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """Product [B, N, W], linear in the inputs, and the shift [B, 1, W] or [W] to be added to it.
+
+        Args:
+            inputs: [B, N, H + F], hidden features and encoded points.
+            codes: [B, L].
+        """
+
+    def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
+        """Cotangents of hidden and encoding from the output's.
+
+        Args:
+            cotangent: [B, N, W].
+            codes: [B, L].
+        """
+        hidden, encoding, _ = self.columns
+        anywhere = cotangent.new_zeros(*cotangent.shape[:-1], hidden + encoding)  # the Jacobian is constant
+        _, pullback = value_and_pullback(lambda inputs: self(inputs, codes)[0], anywhere)
+        return tuple(
+            part if part.shape[-1] else None for part in pullback(cotangent).split([hidden, encoding], -1)
+        )
+
+
+class Concat(Layer):
+    """The code is an input beside the point: W [hidden | encoding | code] + b.
+
+    The code's columns act once per shape; their result, with the bias, is broadcast over its points.
+
+    Source: Park et al. 2019, figure 4.
+    """
+
+    joins_code = True
+
+    def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
+        shift = self.linear.bias
+        if self.columns[2]:
+            with full_precision(codes):  # one error here moves a whole shape
+                shift = F.linear(codes, from_code, self.linear.bias)[:, None]
+        with (
+            nullcontext() if self.columns[0] else full_precision(inputs)
+        ):  # bfloat16 cannot tell points apart
+            return F.linear(inputs, from_points), shift
+
+    def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
+        parts = self.linear.weight.split(self.columns, dim=1)[:2]
+        return tuple(cotangent @ part if part.shape[1] else None for part in parts)
+
+
+class Film(Concat):
+    """The code scales and shifts a layer's output: (1 + s(z)) (W x + b) + t(z).
+
+    s and t are one linear map of the code, a layer's own; pi-GAN has a mapping network before it, which a
+    table of free codes needs less than a generator's noise does.
+
+    Source: Perez et al. 2018 (FiLM); Chan et al. 2021 (pi-GAN) for sines.
+    """
+
+    joins_code = False
+
+    def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
+        super().__init__(hidden, encoding, code, outputs)
+        self.film = nn.Linear(code, 2 * outputs) if code else None
+
+    def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        product, bias = super().forward(inputs, codes)
+        if self.film is None:
+            return product, bias
+        scale, shift = self._scale_and_shift(codes)
+        return (product * scale).to(product.dtype), scale * bias + shift
+
+    def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
+        if self.film is not None:
+            cotangent = cotangent * self._scale_and_shift(codes)[0]
+        return super().pullback(cotangent, codes)
+
+    def _scale_and_shift(self, codes: Tensor) -> tuple[Tensor, Tensor]:
+        with full_precision(codes):  # one error here moves a whole shape
+            scale, shift = self.film(codes)[:, None].chunk(2, dim=-1)
+            return 1 + scale, shift

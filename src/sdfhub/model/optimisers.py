@@ -1,0 +1,107 @@
+"""The optimiser, with a learning rate for the decoder and one for the codes, and schedules of both."""
+
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from functools import partial
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field, NonNegativeInt, PositiveFloat
+from pydantic.dataclasses import dataclass
+from torch import nn
+
+Schedule = Callable[[float], float]
+"""A factor of every learning rate as a function of the share of training done, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class StepDecay:
+    """Multiplied by `factor` after each `every` of training (DeepSDF: halved every 500 of 2000 epochs).
+
+    Args:
+        every: share of training between two steps, in (0, 1].
+        factor: what each step multiplies by, in (0, 1].
+    """
+
+    every: Annotated[float, Field(gt=0, le=1)]
+    factor: Annotated[float, Field(gt=0, le=1)]
+
+    def __call__(self, progress: float) -> float:
+        # 1e-9: a progress that rounds to just below a step's edge belongs after it
+        return self.factor ** math.floor(progress / self.every + 1e-9)
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """Half a cosine from 1 to `final`.
+
+    Args:
+        final: factor at the end, in [0, 1].
+    """
+
+    final: Annotated[float, Field(ge=0, le=1)] = 0.0
+
+    def __call__(self, progress: float) -> float:
+        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+
+@dataclass(frozen=True)
+class Optimisation:
+    """An optimiser over the decoder's weights and the codes, each with its own learning rate.
+
+    Args:
+        lr_decoder: initial learning rate of the decoder, > 0.
+        lr_codes: initial learning rate of the codes, > 0.
+        schedule: factor of both over the share of training; None keeps them.
+        warmup_steps: over which both first rise from 0; no more than half of training. Counted in steps, not
+            as a share: a short training needs it as much as a long one, or its first steps throw the field
+            out of [-delta, delta], where the clamped loss has no gradient.
+        optimizer: makes an optimiser of groups of parameters, such as a class of `torch.optim` or a partial
+            of one. Its fused implementation is taken where it has one.
+    """
+
+    lr_decoder: PositiveFloat
+    lr_codes: PositiveFloat
+    schedule: Schedule | None = None
+    warmup_steps: NonNegativeInt = 0
+    optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam
+
+    @classmethod
+    def of(cls, make: Any) -> "Optimisation":
+        """The optimisation itself, or one that is made of a partial.
+
+        Args:
+            make: an `Optimisation`; a partial of the class; or a partial of an optimiser, such as
+                `partial(torch.optim.AdamW, lr_decoder=1e-3, lr_codes=1e-2, weight_decay=0.01)`, whose
+                keywords may be those of this class too. Its `lr` stands for a rate that is not given.
+        """
+        if hasattr(make, "configure"):
+            return make
+        if make.func is cls:
+            return make()
+        own = {field.name for field in fields(cls)}
+        settings = {name: value for name, value in make.keywords.items() if name in own}
+        rest = {name: value for name, value in make.keywords.items() if name not in own}
+        rates = {name: rest["lr"] for name in ("lr_decoder", "lr_codes") if "lr" in rest}
+        return cls(**rates | settings | {"optimizer": partial(make.func, *make.args, **rest)})
+
+    def configure(
+        self, decoder: Iterable[nn.Parameter], codes: Iterable[nn.Parameter], steps: int
+    ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LambdaLR]:
+        """The optimiser and its schedule, to be stepped after each of `steps` training steps."""
+        groups = [
+            {"params": list(decoder), "lr": self.lr_decoder, "name": "decoder"},
+            {"params": list(codes), "lr": self.lr_codes, "name": "codes"},
+        ]
+        chosen = getattr(self.optimizer, "keywords", {}).keys() & {"fused", "foreach", "differentiable"}
+        can_fuse = "fused" in inspect.signature(self.optimizer).parameters and not chosen
+        optimizer = self.optimizer(groups, fused=True) if can_fuse else self.optimizer(groups)
+        return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.factor(step, steps))
+
+    def factor(self, step: int, steps: int) -> float:
+        """What multiplies both learning rates at `step`, counted from 0, of `steps`."""
+        warmup = min(self.warmup_steps, steps // 2)
+        rise = min(1.0, (step + 1) / warmup) if warmup else 1.0
+        return rise * (self.schedule(step / steps) if self.schedule else 1.0)

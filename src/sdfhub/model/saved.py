@@ -1,0 +1,108 @@
+"""A model from what a file holds: descriptions of its parts, and weights that agree with them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from sdfhub.described import built
+from sdfhub.errors import SdfhubError
+from sdfhub.model.decoder import Decoder
+
+Model = TypeVar("Model", bound=nn.Module)
+
+PARTS = {"decoder": "sdfhub.model", "codes": "sdfhub.model", "loss": "sdfhub.model", "optim": "sdfhub.model"}
+PARTS |= {"computing": "sdfhub.model", "validation": "sdfhub"}
+"""Descriptions among the hyper-parameters of a checkpoint, and where their classes live."""
+
+
+def built_parts(parameters: Any, path: Path, trust: str | Sequence[str] = ()) -> dict[str, Any]:
+    """The constructor's arguments of an auto-decoder, from the hyper-parameters of a checkpoint.
+
+    Raises:
+        SdfhubError: they describe none, or name a class of a package that is not trusted.
+    """
+    if not isinstance(parameters, Mapping) or not {"decoder", "shapes"} <= parameters.keys():
+        raise SdfhubError(f"{path}: describes no auto-decoder; give a checkpoint that a training wrote")
+    parts = {name: built(parameters.get(name), name, trust, within) for name, within in PARTS.items()}
+    return {**parts, "shapes": parameters["shapes"], "seed": parameters.get("seed", 0)}
+
+
+def saved_decoder(
+    description: Any, weights: Mapping[str, Tensor], path: Path, trust: str | Sequence[str] = ()
+) -> Decoder:
+    """The decoder of a description, with its weights, in evaluation mode and without gradients.
+
+    Args:
+        description: plain data.
+        weights: the decoder's `state_dict`.
+        path: the file, for messages.
+        trust: packages beside sdfhub whose classes may be built.
+
+    Raises:
+        SdfhubError: the weights are those of another decoder.
+    """
+
+    def make() -> Decoder:
+        return built(description, "decoder", trust, within="sdfhub.model")
+
+    decoder = model_with_weights(make, description, weights, path)
+    return decoder.eval().requires_grad_(False)
+
+
+def model_with_weights(make: Callable[[], Model], description: Any, weights: Any, path: Path) -> Model:
+    """A model with its weights. Nothing is made that is larger than the weights.
+
+    A few bytes of description could ask for a model without bounds.
+
+    Args:
+        make: the untrained model of the description.
+        description: plain data; its node `decoder`, or all of it.
+        weights: the model's `state_dict`.
+        path: the file, for messages.
+
+    Raises:
+        SdfhubError: the description is none, or that of another model.
+    """
+    _refuse_outsized(description, weights, path)
+    try:
+        with torch.device("meta"):
+            expected = make().state_dict()
+        for name in sorted(expected.keys() | weights.keys()):
+            wanted, got = (list(part[name].shape) if name in part else "none" for part in (expected, weights))
+            if wanted != got:
+                raise SdfhubError(f"holds another model than it describes: {name}: {got}, not {wanted}")
+        with torch.random.fork_rng(devices=[]):  # initial weights are drawn, though only to be replaced
+            model = make()
+        model.load_state_dict(weights)
+    except SdfhubError as error:
+        raise SdfhubError(f"{path}: {error}") from error
+    except (RuntimeError, TypeError, AttributeError, ArithmeticError) as error:
+        raise SdfhubError(f"{path}: describes no model: {error}") from error
+    return model
+
+
+def _refuse_outsized(description: Any, weights: Any, path: Path) -> None:
+    if not isinstance(weights, Mapping) or not all(
+        isinstance(weight, Tensor) and weight.is_contiguous() for weight in weights.values()
+    ):  # a view may claim more numbers than its file holds
+        raise SdfhubError(f"{path}: holds no weights of a model; give a checkpoint that a training wrote")
+    numbers = sum(weight.numel() for weight in weights.values())
+    decoder = description.get("decoder", description) if isinstance(description, Mapping) else {}
+    for key, value in _numbers(decoder, "decoder"):
+        if value > max(numbers, 64):
+            raise SdfhubError(f"{path}: {key}={value} is more than a decoder of {numbers} weights can have")
+
+
+def _numbers(node: Any, key: str) -> Iterator[tuple[str, float]]:
+    """Every number of a plain node, with its dotted key."""
+    if isinstance(node, Mapping):
+        for name, value in node.items():
+            yield from _numbers(value, f"{key}.{name}")
+    elif isinstance(node, list):
+        for value in node:
+            yield from _numbers(value, key)
+    elif isinstance(node, int | float) and not isinstance(node, bool):
+        yield key, node

@@ -1,0 +1,214 @@
+"""A trained shape space from disk: a run's folder, a checkpoint's run, or one exported file.
+
+The border between a user's own words and somebody's file stands here: what a file holds is data. Of its
+descriptions only classes of sdfhub, and of packages that the caller trusts, are built.
+
+A run's folder:
+
+config.yaml       the composed config, interpolations resolved but those of the environment
+split.json        ids of the shapes by role; training ids in the order of the code table
+frames.json       which axis is up, and where the training shapes lie in their sources' frames
+checkpoints/      last.ckpt and others: weights, and the description of the model
+metrics.json, metrics.csv, meshes/, contact_sheet.png, what the loggers write
+"""
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import yaml
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from sdfhub.checkpoint_file import LAST, read_checkpoint
+from sdfhub.data.loading import SdfDataModule
+from sdfhub.described import built
+from sdfhub.errors import SdfhubError
+from sdfhub.model.saved import saved_decoder
+from sdfhub.shapes import Frame
+from sdfhub.space import Space
+from sdfhub.whole_file import write_whole
+
+FORMAT = "sdfhub space 2"
+"""What an exported file says it is; another number where its content means something else."""
+
+About = dict[str, Any]
+"""Plain data of a space: description of its model, config, ids, frames, up, metrics."""
+
+
+def load(
+    path: str | Path, device: str | torch.device | None = None, trust: str | Sequence[str] = ()
+) -> Space:
+    """The trained shape space of a run's folder, or of a file that `sdfhub export` wrote.
+
+    Args:
+        path: `outputs/.../RUN` or `model.safetensors`.
+        device: where it shall compute; None: on a GPU where there is one.
+        trust: packages beside sdfhub whose classes the file may name, such as `"mypkg"`.
+
+    Raises:
+        SdfhubError: nothing usable is there, or not on this machine.
+    """
+    if not isinstance(path, str | Path):
+        raise SdfhubError(f"load takes the path of a run or an exported file, got {path!r:.60}")
+    path = Path(path)
+    if not path.exists():
+        raise SdfhubError(f"{path}: there is no such run or file")
+    where = _device(device)
+    try:
+        about, weights, codes = _of_run(path) if path.is_dir() else _of_file(path)
+        ids = tuple(about["ids"])
+        frames = about["frames"].items()
+        return Space(
+            decoder=saved_decoder(about["model"]["decoder"], weights, path, trust).to(where),
+            codes=codes[: len(ids)].to(where),  # rows behind them are of augmented copies
+            ids=ids,
+            frames={id: Frame(np.array(four[:3], np.float64), float(four[3])) for id, four in frames},
+            up=about["up"],
+            model=about["model"],
+            delta=float(about["model"]["loss"]["delta"]),
+            config=about["config"],
+            metrics=about["metrics"],
+        )
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise SdfhubError(f"{path}: not a shape space that this version reads: {error}") from error
+
+
+def write_space(space: Space, path: Path) -> None:
+    """Writes a space as one file, whole or not at all."""
+    about = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
+    about |= {"frames": plain_frames(space.frames), "metrics": space.metrics}
+    tensors = {f"decoder.{name}": tensor for name, tensor in space.decoder.state_dict().items()}
+    tensors["codes"] = space.codes
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    write_whole(path, save(tensors, metadata={"format": FORMAT, "about": json.dumps(about)}))
+
+
+def plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
+    """Frames as plain numbers: centre and scale, four of them."""
+    return {id: [*map(float, frame.center), float(frame.scale)] for id, frame in frames.items()}
+
+
+def begin_run(
+    run: Path,
+    config: dict[str, Any],
+    train: Sequence[str],
+    held_out: Sequence[str],
+    frames: Mapping[str, Frame],
+    up: Literal["y", "z"],
+) -> None:
+    """Writes down what a run is made of, before it starts; scores of what lay there before go."""
+    (run / "metrics.json").unlink(missing_ok=True)  # else an interrupted run would pass for a finished one
+    write_whole(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
+    write_whole(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
+    write_whole(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))
+
+
+def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
+    """The config and the split of a run's folder.
+
+    Raises:
+        SdfhubError: it is not a run's folder, or one of the files is broken.
+    """
+    try:
+        config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        split = json.loads((run / "split.json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SdfhubError(f"run={run}: not a run's folder ({error.strerror}: {error.filename})") from error
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise SdfhubError(f"run={run}: config.yaml or split.json is broken: {error}") from error
+    are_ids = isinstance(split, dict) and all(
+        isinstance(ids, list) and all(isinstance(id, str) for id in ids) for ids in split.values()
+    )
+    if not isinstance(config, dict) or not are_ids or set(split) != {"train", "held_out"}:
+        raise SdfhubError(f"run={run}: config.yaml or split.json is not what training writes")
+    return config, split
+
+
+def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:
+    """The data that a run's config describes.
+
+    Raises:
+        SdfhubError: it describes none, or names a class of a package that is not trusted.
+    """
+    if "data" not in config:
+        raise SdfhubError("the run's config.yaml says nothing of its data")
+    data = built(with_environment(config["data"]), "data", trust, within="sdfhub.data")
+    if not isinstance(data, SdfDataModule):
+        raise SdfhubError("the run's config.yaml describes no data")
+    return data
+
+
+def with_environment(node: Any) -> Any:
+    """Plain data with `${oc.env:NAME}` replaced by this machine's environment, "" where it has none."""
+    if isinstance(node, Mapping):
+        return {name: with_environment(value) for name, value in node.items()}
+    if not isinstance(node, str):
+        return node
+    return re.sub(r"\$\{oc\.env:(\w+)(?:,([^}]*))?\}", lambda m: os.environ.get(m[1], m[2] or ""), node)
+
+
+def beside(run: str, out: str | None, name: str) -> Path:
+    """The folder of a task's results: `out`, or one in the run's folder or beside its file."""
+    return Path(out) if out else (Path(run) if Path(run).is_dir() else Path(run).parent) / name
+
+
+def _of_run(run: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+    config, split = read_run(run)
+    checkpoint = run / "checkpoints" / LAST
+    content = read_checkpoint(checkpoint)
+    weights = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(weights, dict) or getattr(weights.get("codes.table"), "ndim", 0) != 2:
+        raise SdfhubError(f"{checkpoint}: not a checkpoint of an auto-decoder")
+    codes = weights.pop("codes.table")
+    weights = {name.removeprefix("decoder."): weight for name, weight in weights.items()}
+    frames = _json(run / "frames.json", {"up": "z", "shapes": {}})
+    about = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
+    about |= {"metrics": _json(run / "metrics.json", None), "up": frames["up"], "frames": frames["shapes"]}
+    return about, weights, codes
+
+
+def _json(path: Path, otherwise: Any) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return otherwise
+    except (ValueError, OSError, RecursionError) as error:
+        raise SdfhubError(f"{path}: is broken: {error}") from error
+
+
+def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                format = repr(metadata.get("format", "unknown"))[:60]
+                raise SdfhubError(f"{path}: its format is {format}, not {FORMAT!r}: export the run again")
+            about = json.loads(metadata["about"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+        codes = tensors.pop("codes")
+        weights = {name.removeprefix("decoder."): tensor for name, tensor in tensors.items()}
+        return (
+            {key: about[key] for key in ("model", "config", "ids", "frames", "up", "metrics")},
+            weights,
+            codes,
+        )
+    except SdfhubError:
+        raise
+    except Exception as error:  # the reader knows a dozen kinds of damage
+        raise SdfhubError(f"{path}: not a readable export; give a file that `sdfhub export` wrote") from error
+
+
+def _device(device: str | torch.device | None) -> torch.device:
+    try:
+        wanted = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        torch.empty(1, device=wanted)
+    except (RuntimeError, AssertionError) as error:
+        raise SdfhubError(f"device={device}: not on this machine ({str(error).splitlines()[0]})") from error
+    return wanted

@@ -1,0 +1,123 @@
+"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, fit better.
+
+A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
+"""
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from sdfhub.checkpoint_file import LAST
+from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.reconstruction.reconstructor import Reconstructor
+from sdfhub.reconstruction.result import Limits
+from sdfhub.scans.evidence import BOUNDS
+from sdfhub.scans.simulated import VIEWS, ScanKind
+from sdfhub.whole_file import file_sha256, write_whole
+
+log = logging.getLogger(__name__)
+
+FILE = "calibration.json"
+RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
+"""What is judged: kept beside the settings, so that limits of another rule are not taken for these."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How limits are found.
+
+    Args:
+        shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
+        spread: standard deviations that a value's logarithm may lie above the mean of theirs, > 0.
+        reach: times the largest of theirs, however far theirs spread, > 0.
+    """
+
+    shapes: int
+    spread: float
+    reach: float
+
+    def __post_init__(self):
+        if (self.shapes < 3 and self.shapes != 0) or min(self.spread, self.reach) <= 0:
+            raise ValueError("shapes must be at least 3, or 0 for no verdicts; spread and reach positive")
+
+    def limit(self, values: np.ndarray) -> float:
+        """The value above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
+        values = np.maximum(values, 1e-12)  # a limit of 0 would have no multiples
+        logarithms = np.log(values)
+        usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
+        return float(min(usual, self.reach * np.max(values)))
+
+    def limits(
+        self,
+        run: Path,
+        settings: dict[str, Any],
+        kinds: Sequence[ScanKind],
+        reconstructor: Reconstructor,
+        unseen_shapes: Callable[[int], list[StoredShape]],
+    ) -> dict[ScanKind, Limits]:
+        """The limits of each kind of scan: the run's own, or measured now and kept.
+
+        Args:
+            run: its folder.
+            settings: plain, all that fits depend on.
+            kinds: that are wanted.
+            reconstructor: fits scans.
+            unseen_shapes: up to so many shapes of the run's data that it was not trained on.
+
+        Raises:
+            SdfhubError: the run's data cannot be had here, or it has too few unseen shapes.
+        """
+        key = digest(run, settings)
+        known = _read(run / FILE).get(key, {})
+        missing = [kind for kind in kinds if "limits" not in known.get(str(kind), {})]
+        shapes = unseen_shapes(self.shapes) if missing else []
+        if missing and len(shapes) < 3:
+            raise SdfhubError(f"the run's data has {len(shapes)} unseen shapes, a calibration needs 3")
+        for kind in missing:
+            log.info("calibration: %s: fits %d unseen shapes, once", kind, len(shapes))
+            entry = self._measured(kind, shapes, reconstructor)
+            kept = _read(run / FILE)  # again: another process may have added to it meanwhile
+            known = kept.get(key, {}) | known | {str(kind): entry}
+            try:
+                write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+            except OSError as error:  # somebody else's run: the limits serve this command at least
+                log.warning("%s: is not kept: %s", run / FILE, error.strerror)
+        return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
+
+    def _measured(
+        self, kind: ScanKind, shapes: Sequence[StoredShape], reconstructor: Reconstructor
+    ) -> dict[str, Any]:
+        """Limits for a kind of scan, and the residuals and doubts of unseen shapes that they come from."""
+        scans = kind.observations(shapes, reconstructor.evidence)
+        residuals, doubts = [], []
+        for scan in tqdm(scans, desc="calibrating", unit="scan", leave=False, disable=None):
+            fitted = reconstructor.fitted([scan])
+            residuals.append(float(fitted.residuals))
+            doubts.append(float(reconstructor.doubts(fitted)))
+        limits = Limits(self.limit(np.array(residuals)), self.limit(np.array(doubts)))
+        entry = {"limits": asdict(limits), "residuals": residuals, "doubts": doubts}
+        return entry | {"shapes": [shape.id for shape in shapes]}
+
+
+def digest(run: Path, settings: dict[str, Any]) -> str:
+    """What a run's weights and the settings of a fit are told apart by."""
+    weights = file_sha256(run / "checkpoints" / LAST)
+    text = json.dumps([weights, settings, RULE, VIEWS, BOUNDS], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What is kept; nothing where the file is missing or broken, which costs a calibration."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        return {key: {kind: dict(entry) for kind, entry in kinds.items()} for key, kinds in kept.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}

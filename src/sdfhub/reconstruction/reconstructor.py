@@ -1,0 +1,138 @@
+"""Scans through a trained space: observed, fitted, meshed in their own frames, judged, written one by one."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from sdfhub.errors import SdfhubError
+from sdfhub.geometry.mesh_file import write_mesh
+from sdfhub.geometry.mesher import Mesh
+from sdfhub.latent.fitting import Fit, Fitted
+from sdfhub.latent.similarity import PoseRange
+from sdfhub.reconstruction.result import Limits, Result
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.observed_scan import ObservedScan, ScanFrame, observe
+from sdfhub.scans.scan import read_scan
+from sdfhub.scans.simulated import ScanKind
+from sdfhub.space import Space
+
+
+@dataclass(frozen=True)
+class Reconstructor:
+    """A trained space and how scans are fitted in it.
+
+    Args:
+        space: where codes are looked for.
+        fit: finds codes and poses.
+        evidence: makes observations of scans.
+        frame: of the scans.
+        poses: how far the scans' frames may be off; None where they are known.
+        resolution: points along an axis of the marching-cubes grid, >= 2.
+    """
+
+    space: Space
+    fit: Fit
+    evidence: Evidence
+    frame: ScanFrame
+    poses: PoseRange | None
+    resolution: int
+
+    def read(self, path: Path, sensor: Sequence[float] | None) -> ObservedScan:
+        """The scan in a file, observed; the same file gives the same observation.
+
+        Args:
+            path: of a scan.
+            sensor: [3] from where a cloud was seen that does not say so itself, in its frame, or None.
+
+        Raises:
+            SdfhubError: names the file.
+        """
+        scan = read_scan(path)
+        if sensor is not None and scan.kind in ("bare", "oriented"):
+            scan = replace(scan, sensor=np.array(sensor, dtype=np.float64))
+        try:
+            return observe(scan, self.evidence, self.frame, np.random.default_rng(0))
+        except SdfhubError as error:
+            raise SdfhubError(f"{path}: {error}") from error
+
+    def fitted(self, scans: Sequence[ObservedScan]) -> Fitted:
+        """Codes, residuals and poses of scans, each found as if it were alone."""
+        observations = [scan.observation for scan in scans]
+        return self.fit(self.space.decoder, self.space.codes, observations, self.space.delta, self.poses)
+
+    def doubts(self, fitted: Fitted) -> Tensor:
+        """[B] residuals, each times the fourth power of one plus how unusual its code is.
+
+        A space can bend to a stranger: its residual is small, but its code lies far from all known ones.
+        """
+        return fitted.residuals * (1 + self.space.unusual(fitted.codes)) ** 4
+
+    def meshes(self, scans: Sequence[ObservedScan], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
+        """Meshes in the scans' own frames, and the matrices [4, 4] from the normalised frame to these."""
+        for row, mesh in enumerate(self.space.meshes(fitted.codes, self.resolution)):
+            matrix = to_scan(scans[row], fitted, row)
+            yield (mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]), matrix
+
+    def reconstruct(
+        self,
+        scans: Mapping[str, ObservedScan],
+        limits: Mapping[ScanKind, Limits],
+        out: Path,
+        together: int,
+    ) -> Iterator[Result]:
+        """Fits and meshes scans by name and writes NAME.ply and NAME.json of each, as they are found.
+
+        One that fails does not stop the others.
+
+        Args:
+            scans: by the names of their files.
+            limits: by kind of scan.
+            out: folder.
+            together: scans fitted side by side.
+        """
+        names = list(scans)
+        for first in range(0, len(names), together):
+            group = {name: scans[name] for name in names[first : first + together]}
+            try:
+                yield from self._reconstruct_group(group, limits, out)
+            except SdfhubError as error:
+                if len(group) == 1:
+                    yield Result(names[first], reason=str(error))
+                else:  # alone, each shows whether it is the one that fails
+                    yield from self.reconstruct(group, limits, out, 1)
+
+    def _reconstruct_group(
+        self, group: dict[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path
+    ) -> list[Result]:
+        scans, results = list(group.values()), []
+        fitted = self.fitted(scans)
+        doubts = self.doubts(fitted).tolist()
+        near = self.poses.holds(fitted.poses).tolist() if self.poses else [True] * len(group)
+        for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
+            name, kind = list(group)[row], ScanKind.of(scans[row])
+            result = Result(
+                name,
+                kind=str(kind),
+                residual=float(fitted.residuals[row]),
+                doubt=doubts[row],
+                code=tuple(fitted.codes[row].tolist()),
+                frame=tuple(map(tuple, matrix.tolist())),
+                mesh=f"{name}.ply" if len(mesh[1]) else None,
+            )
+            results.append(result.judged(limits.get(kind), near[row]))
+            write_mesh(*mesh, out / f"{name}.ply")
+            results[-1].write(out)  # last: a result is whole when it is described
+        return results
+
+
+def to_scan(scan: ObservedScan, fitted: Fitted, row: int) -> np.ndarray:
+    """[4, 4] float64 matrix from the normalised frame to that of a scan."""
+    observed_to_scan, pose = np.eye(4), np.eye(4)
+    observed_to_scan[:3] = np.column_stack([np.eye(3) / scan.frame.scale, scan.frame.center])
+    if fitted.poses is not None:
+        scale, rotation, shift = (part[row].double().cpu().numpy() for part in fitted.poses)
+        pose[:3] = np.column_stack([scale * rotation, shift])
+    return observed_to_scan @ np.linalg.inv(pose)

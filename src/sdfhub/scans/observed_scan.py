@@ -1,0 +1,163 @@
+"""A scan in the frame of a shape space: the observation that is fitted, and the way back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sdfhub.data.loading.batches import signed_samples
+from sdfhub.data.preparation.sampling import prepare_mesh
+from sdfhub.data.preparation.settings import Preparation
+from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.scan import LEAST, Scan
+from sdfhub.shapes import NORMALIZED, RADIUS, Frame, Observation
+
+ScanFrame = Frame | Literal["shape", "unknown"]
+"""How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
+
+MOST = 2**16
+"""Points of a cloud that are used: a random draw of more."""
+
+LARGEST, SMALLEST = 1.2, 0.2
+"""Distance of the farthest point from the origin that a scan in the normalised frame may have."""
+
+FAR = 2.5
+"""The same of signed samples, which are also drawn around the shape."""
+
+WHOLE = "give frame=shape if it is whole"
+
+
+@dataclass(frozen=True)
+class ObservedScan:
+    """What a scan says of the shape behind it.
+
+    Args:
+        kind: samples, oriented, bare or view.
+        count: points of the scan.
+        observation: in the normalised frame, or near it where that is unknown.
+        frame: where the observation's frame lies in the scan's.
+    """
+
+    kind: str
+    count: int
+    observation: Observation
+    frame: Frame
+
+
+def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
+    """What a scan says of the shape behind it.
+
+    A mesh becomes signed samples. Signed samples lie in the normalised frame as they are, unless another
+    known frame is given. A view shows no whole bounding box, so that its frame must be known or unknown.
+
+    Raises:
+        SdfhubError: the scan does not fit the frame; RejectedMesh where its mesh cannot be trusted.
+    """
+    if scan.faces is not None:
+        return _observe_mesh(scan, evidence, frame, rng)
+    if scan.kind == "view" and frame == "shape":
+        raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
+    if isinstance(frame, Frame):
+        lies = frame
+    else:
+        lies = NORMALIZED if scan.sdf is not None else box_frame(scan.points)
+    points = lies.to_normalized(scan.points)
+    advice = WHOLE if scan.sdf is None else "signed samples belong there"
+    refuse_misplaced(points, LARGEST if scan.sdf is None else FAR, advice)
+    if np.ptp(points, axis=0).max() < SMALLEST:
+        raise SdfhubError("its points all lie in one place")
+    if scan.sdf is not None:
+        observation = evidence.of_samples(points, scan.sdf * lies.scale, rng)
+        lies = scan.frame if scan.frame is not None and lies is NORMALIZED else lies
+        return ObservedScan("samples", len(points), observation, lies)
+    points, normals = thinned(*distinct(points, scan.normals), rng)
+    if scan.sensor is None:
+        observation = evidence.of_cloud(points, normals, rng)
+    else:
+        observation = evidence.of_view(points, normals, lies.to_normalized(scan.sensor), rng)
+    return ObservedScan(scan.kind, len(points), observation, lies)
+
+
+def _observe_mesh(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
+    if isinstance(frame, Frame):
+        refuse_misplaced(frame.to_normalized(scan.points), LARGEST, WHOLE)
+    preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
+    prepared = prepare_mesh((scan.points, scan.faces), preparation)
+    points, sdf = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64)
+    own = Frame(prepared.center, prepared.scale)
+    if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
+        seen = observe(Scan(own.to_source(points), sdf=sdf / own.scale), evidence, frame, rng)
+    else:
+        seen = observe(Scan(points, sdf=sdf, frame=own), evidence, NORMALIZED, rng)
+    return replace(seen, count=len(scan.points))
+
+
+def observations_of(
+    shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]
+) -> list[Observation]:
+    """Signed samples of prepared shapes as observations.
+
+    Args:
+        shapes: normalised frame.
+        samples: of each, half of them inside; None for all.
+        seeds: one a shape, so that its samples do not depend on its neighbours.
+    """
+    observations = []
+    for shape, seed in zip(shapes, seeds, strict=True):
+        if samples is None:
+            rows = np.concatenate([shape.outside, shape.inside])
+        else:
+            rows = signed_samples(shape, samples, np.random.default_rng(seed))
+        observations.append(Observation.of_samples(rows[:, :3], rows[:, 3]))
+    return observations
+
+
+def refuse_misplaced(points: np.ndarray, largest: float, advice: str) -> None:
+    """Refuses points [N, 3] of another frame than the normalised one.
+
+    Raises:
+        SdfhubError: the farthest lies nearer to the origin than SMALLEST or farther than `largest`.
+    """
+    reach = float(np.linalg.norm(points, axis=1).max())
+    if not SMALLEST <= reach <= largest:
+        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {advice}")
+
+
+def distinct(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Each place of points [N, 3] once, with its first normal: repeated ones would look infinitely dense.
+
+    Raises:
+        SdfhubError: too few are left.
+    """
+    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if len(rows) < LEAST:
+        raise SdfhubError(f"holds {len(rows)} different points; at least {LEAST} are needed to know a shape")
+    return points[rows], None if normals is None else normals[rows]
+
+
+def thinned(
+    points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """At most MOST of the points [N, 3] and of their normals."""
+    if len(points) <= MOST:
+        return points, normals
+    kept = rng.permutation(len(points))[:MOST]
+    return points[kept], None if normals is None else normals[kept]
+
+
+def box_frame(points: np.ndarray) -> Frame:
+    """The frame by which the box of points [N, 3] comes to 0 and the farthest to 1 / 1.03.
+
+    Raises:
+        SdfhubError: they lie in one place, on a line or in a plane, or too far out to be measured.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = high / 2 - low / 2
+    center = low + half
+    farthest = half.max() * np.linalg.norm((points - center) / max(half.max(), 1e-300), axis=1).max()
+    if not np.isfinite(farthest) or half.max() <= 0 or half.min() < 1e-3 * half.max():
+        raise SdfhubError(f"its extents are {2 * half}: no shape with an inside has such")
+    return Frame(center, float(RADIUS / farthest))

@@ -1,0 +1,149 @@
+"""Simulated scans of a shape: kinds of scans, and points all over a mesh or what one sensor sees of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from sdfhub.data.preparation.visibility import points_on_faces
+from sdfhub.data.store.store import shape_seed
+from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.errors import SdfhubError
+from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.observed_scan import ObservedScan, observe
+from sdfhub.scans.scan import LEAST, Scan
+from sdfhub.shapes import NORMALIZED, NormalizedMesh
+from sdfhub.triangles import face_normals
+
+NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
+"""Levels of noise that are told apart, normalised frame."""
+
+HALF_VIEW = np.tan(np.radians(24))
+"""Half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away."""
+
+DISTANCE, HEIGHT = 2.5, 0.5
+"""Of sensors from the origin, and how far up they may stand, as a sine."""
+
+PIXELS = 100
+LOOKS = 20
+"""Places tried for a sensor, until it sees enough points to know a shape."""
+
+VIEWS = 2
+"""Simulated of each shape: a view depends on where the sensor stood."""
+
+
+@dataclass(frozen=True)
+class ScanKind:
+    """What scans have in common that are judged by the same limits: what can be simulated.
+
+    Args:
+        kind: samples, oriented, bare or view.
+        count: points, a power of two; 0 where their number does not matter.
+        noise: one of NOISES.
+    """
+
+    kind: str
+    count: int = 0
+    noise: float = 0.0
+
+    @classmethod
+    def of(cls, scan: ObservedScan) -> "ScanKind":
+        """The kind of an observed scan."""
+        if scan.kind == "samples":
+            return cls("samples")
+        least = 0.95 * scan.observation.noise  # noisier scans leave larger residuals
+        noise = next((level for level in NOISES if level >= least), NOISES[-1])
+        power = np.clip(round(np.log2(scan.count)), 6, 16)
+        return cls(scan.kind, 0 if scan.kind == "view" else int(2**power), noise)
+
+    def __str__(self) -> str:
+        count = f", {self.count} points" if self.count else ""
+        return f"{self.kind}{count}" + (f", noise {self.noise:g}" if self.noise else "")
+
+    def observations(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[ObservedScan]:
+        """Simulated scans of shapes, observed: one of each shape, several views."""
+        numbers = range(VIEWS if self.kind == "view" else 1)
+        return [self.observe(shape, evidence, number) for shape in shapes for number in numbers]
+
+    def observe(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> ObservedScan:
+        """A simulated scan of a shape, in the normalised frame, observed; another number gives another."""
+        rng = np.random.default_rng([shape_seed(shape), number])
+        return observe(self.scan(shape, number), evidence, NORMALIZED, rng)
+
+    def scan(self, shape: StoredShape, number: int = 0) -> Scan:
+        """A simulated scan of a shape, in the normalised frame; another number gives another one.
+
+        Raises:
+            SdfhubError: the shape has no mesh to be scanned.
+        """
+        rng = np.random.default_rng([shape_seed(shape), number])
+        if self.kind == "samples":
+            rows = np.concatenate([shape.outside, shape.inside]).astype(np.float64)
+            return Scan(rows[:, :3], sdf=rows[:, 3])
+        if shape.mesh is None:
+            raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")
+        if self.kind == "view":
+            for _ in range(LOOKS):
+                sensor = random_sensor(rng, shape.up)
+                points = view_scan(shape.mesh, sensor, PIXELS, self.noise, rng)
+                if len(points) >= LEAST:  # a rod seen along its axis shows less
+                    return Scan(points, sensor=sensor)
+            raise SdfhubError(f"{shape.id}: is too thin to be seen from anywhere")
+        points, normals = surface_scan(shape.mesh, self.count, self.noise, rng)
+        return Scan(points, normals if self.kind == "oriented" else None)
+
+
+def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
+    """[3] a place around the unit ball, not far above or below its middle."""
+    height, turn = rng.uniform(-HEIGHT, HEIGHT), rng.uniform(0, 2 * np.pi)
+    flat = np.sqrt(1 - height**2)
+    x, y, z = flat * np.cos(turn), flat * np.sin(turn), height
+    return DISTANCE * np.array([x, y, z] if up == "z" else [x, z, y])
+
+
+def surface_scan(
+    mesh: NormalizedMesh, count: int, noise: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [count, 3] spread evenly over a mesh, moved by normal noise, and their faces' normals.
+
+    Args:
+        mesh: its faces turned outwards.
+        count: points.
+        noise: standard deviation along each axis, normalised frame.
+        rng: of the points.
+    """
+    normals = face_normals(mesh.vertices, mesh.faces)
+    area = np.linalg.norm(normals, axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    points = points_on_faces(mesh.vertices[mesh.faces], face, rng)
+    return points + noise * rng.standard_normal(points.shape), normals[face] / area[face, None]
+
+
+def view_scan(
+    mesh: NormalizedMesh, sensor: np.ndarray, pixels: int, noise: float, rng: np.random.Generator
+) -> np.ndarray:
+    """What a sensor that looks at the origin sees of a mesh: [M, 3] points, at most one a pixel.
+
+    Args:
+        mesh: what stands there.
+        sensor: [3], outside the unit ball, normalised frame.
+        pixels: of the picture, either way.
+        noise: standard deviation along the rays.
+        rng: of the noise.
+    """
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    forward = -sensor / np.linalg.norm(sensor)
+    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
+    steps = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * HALF_VIEW
+    x, y = np.meshgrid(steps, steps)
+    rays = forward + x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(right, forward)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    origins = np.broadcast_to(sensor.astype(np.float32), rays.shape).copy()
+    hits = scene.run(origins, rays, query="INTERSECT", output=1)
+    seen = hits["primID"] >= 0
+    depth = hits["tfar"][seen] + noise * rng.standard_normal(seen.sum())
+    return sensor + depth[:, None] * rays[seen].astype(np.float64)
