@@ -42,8 +42,8 @@ from sdfhub.data.workers import map_in_processes  # noqa: E402
 from sdfhub.errors import RejectedMesh, SdfhubError  # noqa: E402
 from sdfhub.geometry.morton import morton_order  # noqa: E402
 from sdfhub.procedural import generate  # noqa: E402
-from sdfhub.shapes import ShapeSamples  # noqa: E402
-from tests.broken_twins import BREAKAGES, Triangles, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
+from sdfhub.shapes import Mesh, ShapeSamples  # noqa: E402
+from tests.broken_twins import BREAKAGES, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 from tests.categories import CATEGORIES  # noqa: E402
 
 SUFFIXES = {".obj", ".ply", ".stl", ".off", ".glb"}
@@ -112,7 +112,7 @@ def raw_rates(samples: ShapeSamples) -> tuple[float, float, float]:
     return in_order, shuffled, rate(lambda: tree.squared_distance(*query), len(points))
 
 
-Loader = Callable[[], Triangles]
+Loader = Callable[[], Mesh]
 
 
 def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
@@ -136,7 +136,7 @@ def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
         yield path.stem, lambda path=path: _loaded(path)
 
 
-def _loaded(path: Path) -> Triangles:
+def _loaded(path: Path) -> Mesh:
     mesh = trimesh.load_mesh(path, process=False)
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
@@ -227,7 +227,7 @@ def print_scaling(folder: Path | None, limit: int, preparation: Preparation, rou
         print(f"| {' | '.join(pairs)} |", flush=True)
 
 
-def clean_shapes() -> list[Triangles]:
+def clean_shapes() -> list[Mesh]:
     """Closed shapes: chairs of our own, a ring, procedural chairs."""
     chairs = [refined(Manifold.batch_boolean(chair_parts(seed), OpType.Add)) for seed in range(2)]
     return [*map(triangles, (*chairs, ring())), *(generate("chairs", index) for index in range(3))]

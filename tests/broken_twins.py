@@ -6,12 +6,10 @@ import igl
 import manifold3d
 import numpy as np
 
-from sdfhub.shapes import ShapeSamples
-
-Triangles = tuple[np.ndarray, np.ndarray]
+from sdfhub.shapes import Mesh, ShapeSamples
 
 
-def triangles(solid: manifold3d.Manifold) -> Triangles:
+def triangles(solid: manifold3d.Manifold) -> Mesh:
     """Vertices [V, 3] float64 and faces [F, 3] int64 of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties[:, :3], np.float64), np.array(mesh.tri_verts, np.int64)
@@ -43,25 +41,25 @@ def refined(solid: manifold3d.Manifold, edge: float = 0.15) -> manifold3d.Manifo
     return solid.refine_to_length(edge)
 
 
-def flipped(mesh: Triangles, rng: np.random.Generator) -> Triangles:
+def flipped(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """Half of the faces turned inside out."""
     vertices, faces = mesh
     return vertices, np.where(rng.random(len(faces))[:, None] < 0.5, faces[:, ::-1], faces)
 
 
-def punctured(mesh: Triangles, rng: np.random.Generator) -> Triangles:
+def punctured(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """2% of the faces gone."""
     vertices, faces = mesh
     return vertices, faces[rng.random(len(faces)) >= 0.02]
 
 
-def duplicated(mesh: Triangles, rng: np.random.Generator) -> Triangles:
+def duplicated(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """10% of the faces twice."""
     vertices, faces = mesh
     return vertices, np.concatenate([faces, faces[rng.random(len(faces)) < 0.1]])
 
 
-def with_inner_shell(mesh: Triangles, rng: np.random.Generator) -> Triangles:
+def with_inner_shell(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """A stray ball, inside out, where the shape is thickest."""
     vertices, faces = mesh
     points = rng.uniform(vertices.min(axis=0), vertices.max(axis=0), (20_000, 3))
@@ -71,14 +69,14 @@ def with_inner_shell(mesh: Triangles, rng: np.random.Generator) -> Triangles:
     return np.concatenate([vertices, more]), np.concatenate([faces, shell[:, ::-1] + len(vertices)])
 
 
-def all_of_it(mesh: Triangles, rng: np.random.Generator) -> Triangles:
+def all_of_it(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """Every breakage at once."""
     for broken in (with_inner_shell, punctured, duplicated, flipped):
         mesh = broken(mesh, rng)
     return mesh
 
 
-BREAKAGES: dict[str, Callable[[Triangles, np.random.Generator], Triangles]] = {
+BREAKAGES: dict[str, Callable[[Mesh, np.random.Generator], Mesh]] = {
     "half the faces flipped": flipped,
     "2% of faces deleted": punctured,
     "10% duplicated": duplicated,
@@ -87,7 +85,7 @@ BREAKAGES: dict[str, Callable[[Triangles, np.random.Generator], Triangles]] = {
 }
 
 
-def signed_distance(clean: Triangles, points: np.ndarray) -> np.ndarray:
+def signed_distance(clean: Mesh, points: np.ndarray) -> np.ndarray:
     """[N] exact signed distances to a clean closed mesh, negative inside; signs by its winding number."""
     tree = igl.AABB()
     tree.init(*clean)
@@ -95,7 +93,7 @@ def signed_distance(clean: Triangles, points: np.ndarray) -> np.ndarray:
     return np.where(igl.fast_winding_number(*clean, points) > 0.5, -distance, distance)
 
 
-def errors(samples: ShapeSamples, clean: Triangles, count: int = 20_000) -> tuple[float, float]:
+def errors(samples: ShapeSamples, clean: Mesh, count: int = 20_000) -> tuple[float, float]:
     """Share of right signs and mean error of the distance, normalised units, of the first `count` samples."""
     source = samples.points[:count].astype(np.float64) / samples.scale + samples.center
     truth = signed_distance(clean, source) * samples.scale

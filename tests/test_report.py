@@ -23,7 +23,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report import pictures
 from sdfhub.report.charts import shape_chart
-from sdfhub.report.meshes import Mesh, packed, reconstruction
+from sdfhub.report.meshes import ShownMesh, packed, reconstruction
 from sdfhub.report.pictures import Gallery
 from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import ShapeScore, read_sweep
@@ -400,7 +400,7 @@ def test_packed_meshes_unpack_to_the_same_places_within_a_step():
     import base64
 
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.9)
-    mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces), "y")
+    mesh = ShownMesh(np.asarray(ball.vertices), np.asarray(ball.faces), "y")
     found = packed(mesh, triangles=10_000)
     content = base64.b64decode(found["data"])
     places = np.frombuffer(content, "<i2", found["vertices"] * 3).reshape(-1, 3) / 32767

@@ -7,7 +7,6 @@ A logger of your own joins with a line for either: `show_picture.register(MyLogg
 import tempfile
 from functools import singledispatch
 from pathlib import Path
-from typing import Literal
 
 import fast_simplification
 import numpy as np
@@ -16,6 +15,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoa
 from PIL import Image
 
 from sdfhub.geometry.mesh_file import write_row
+from sdfhub.geometry.up_axis import UpAxis, turned_up
 
 TENSORBOARD_VERTICES = 60_000
 """TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""
@@ -35,7 +35,7 @@ def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> Non
 
 @singledispatch
 def show_mesh(
-    logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: Literal["y", "z"], step: int
+    logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: UpAxis, step: int
 ) -> None:
     """Shows a mesh upright in a logger.
 
@@ -57,9 +57,7 @@ def _(logger: TensorBoardLogger, name, vertices, faces, up, step):
     if len(vertices) > TENSORBOARD_VERTICES:
         share = 1 - TENSORBOARD_VERTICES / len(vertices)
         vertices, faces = fast_simplification.simplify(vertices.astype(np.float32), faces, share)
-    if up == "z":  # TensorBoard has y up
-        vertices = vertices[:, [0, 2, 1]] * [1, 1, -1]
-    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+    vertices, faces = np.asarray(turned_up(vertices, up, "y"), np.float32), np.asarray(faces, np.int32)
     logger.experiment.add_mesh(
         name, torch.from_numpy(vertices)[None], faces=torch.from_numpy(faces)[None], global_step=step
     )

@@ -4,22 +4,22 @@ import base64
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import fast_simplification
 import numpy as np
 import trimesh
 
 from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import Cell, ShapeScore
-from sdfhub.shapes import RADIUS
+from sdfhub.shapes import Frame
 
 FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
 
 @dataclass(frozen=True)
-class Mesh:
+class ShownMesh:
     """A mesh to be looked at.
 
     Args:
@@ -30,16 +30,18 @@ class Mesh:
 
     vertices: np.ndarray
     faces: np.ndarray
-    up: Literal["y", "z"]
+    up: UpAxis
 
 
-def true_mesh(truth: StoredShape | None) -> Mesh | None:
+def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
     """The true mesh; None where it cannot be had."""
     mesh = truth.mesh if truth else None
-    return Mesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
+    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
 
 
-def reconstruction(cell: Path, role: str, score: ShapeScore | None, truth: StoredShape | None) -> Mesh | None:
+def reconstruction(
+    cell: Path, role: str, score: ShapeScore | None, truth: StoredShape | None
+) -> ShownMesh | None:
     """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
 
     Where the truth is not there to say what the frame was, the mesh's own extent does.
@@ -54,17 +56,13 @@ def reconstruction(cell: Path, role: str, score: ShapeScore | None, truth: Store
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
             return None
+        frame = Frame(truth.center, truth.scale) if truth else Frame.around(vertices)[0]
     except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
         return None
-    if truth is None:
-        center = (vertices.min(0) + vertices.max(0)) / 2
-        scale = RADIUS / max(np.linalg.norm(vertices - center, axis=1).max(), 1e-12)
-    else:
-        center, scale = truth.center, truth.scale
-    return Mesh((vertices - center) * scale, faces, truth.up if truth else "z")
+    return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")
 
 
-def packed(mesh: Mesh, triangles: int) -> dict[str, int | str]:
+def packed(mesh: ShownMesh, triangles: int) -> dict[str, int | str]:
     """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
 
     Returns:
@@ -76,8 +74,7 @@ def packed(mesh: Mesh, triangles: int) -> dict[str, int | str]:
     if len(vertices) > 65_535:  # many loose triangles do not decimate
         faces = faces[(faces < 65_535).all(axis=1)]
         vertices = vertices[:65_535]
-    if mesh.up == "y":
-        vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
+    vertices = turned_up(vertices, mesh.up, "z")
     places = (np.clip(vertices, -1, 1) * 32767).astype("<i2").tobytes()
     data = base64.b64encode(places + np.asarray(faces).astype("<u2").tobytes()).decode()
     return {"vertices": len(vertices), "faces": len(faces), "data": data}

@@ -11,7 +11,7 @@ from PIL import Image
 
 from sdfhub.data.workers import stream_in_processes, workers_worth
 from sdfhub.geometry.render import render
-from sdfhub.report.meshes import FindTruth, Mesh, packed, reconstruction, true_mesh
+from sdfhub.report.meshes import FindTruth, ShownMesh, packed, reconstruction, true_mesh
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
 from sdfhub.report.rows import Group
 
@@ -53,7 +53,7 @@ class Gallery:
 
     def __init__(self, find_truth: FindTruth):
         self.find_truth = find_truth
-        self._wanted: dict[tuple, Callable[[], Mesh | None]] = {}
+        self._wanted: dict[tuple, Callable[[], ShownMesh | None]] = {}
         self._images: dict[tuple, np.ndarray | None] = {}
 
     def sheets(self, groups: list[Group], count: int) -> list[tuple[Sheet, Sheet]]:
@@ -115,7 +115,7 @@ class Gallery:
             shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
         return shapes
 
-    def _mesh(self, cell: Cell, role: str, id: str) -> Callable[[], Mesh | None]:
+    def _mesh(self, cell: Cell, role: str, id: str) -> Callable[[], ShownMesh | None]:
         """Reads the reconstruction of a shape, in whatever process."""
         score = _scores(cell, role).get(id)
         return partial(reconstruction, cell.folder, role, score, self.find_truth(cell, id))
@@ -132,12 +132,12 @@ class Gallery:
         image = self._image(("truth", truth.fingerprint), partial(true_mesh, truth)) if truth else None
         return Tile(image, "no truth" if image is None else caption)
 
-    def _image(self, key: tuple, mesh: Callable[[], Mesh | None]) -> np.ndarray | None:
+    def _image(self, key: tuple, mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
         self._wanted[key] = mesh
         return self._images.get(key)
 
 
-def picture(read_mesh: Callable[[], Mesh | None]) -> np.ndarray | None:
+def picture(read_mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
     """[S, S, 3] uint8 of a mesh from the usual side; None without one."""
     mesh = read_mesh()
     return render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER) if mesh else None

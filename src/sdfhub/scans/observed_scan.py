@@ -1,6 +1,7 @@
 """A scan in the frame of a shape space: the observation that is fitted, and the way back."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,7 +14,7 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.scan import LEAST, Scan
-from sdfhub.shapes import NORMALIZED, RADIUS, Frame, Observation
+from sdfhub.shapes import NORMALIZED, Frame, Observation
 
 ScanFrame = Frame | Literal["shape", "unknown"]
 """How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
@@ -154,10 +155,8 @@ def box_frame(points: np.ndarray) -> Frame:
     Raises:
         SdfhubError: they lie in one place, on a line or in a plane, or too far out to be measured.
     """
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = high / 2 - low / 2
-    center = low + half
-    farthest = half.max() * np.linalg.norm((points - center) / max(half.max(), 1e-300), axis=1).max()
-    if not np.isfinite(farthest) or half.max() <= 0 or half.min() < 1e-3 * half.max():
-        raise SdfhubError(f"its extents are {2 * half}: no shape with an inside has such")
-    return Frame(center, float(RADIUS / farthest))
+    half = points.max(axis=0) / 2 - points.min(axis=0) / 2
+    if half.min() >= 1e-3 * half.max() > 0:
+        with suppress(ValueError):
+            return Frame.around(points)[0]
+    raise SdfhubError(f"its extents are {2 * half}: no shape with an inside has such")

@@ -7,15 +7,14 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.data.preparation.visibility import points_on_faces
 from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, NormalizedMesh
-from sdfhub.triangles import face_normals
 
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
 """Levels of noise that are told apart, normalised frame."""
@@ -114,11 +113,8 @@ def surface_scan(
         noise: standard deviation along each axis, normalised frame.
         rng: of the points.
     """
-    normals = face_normals(mesh.vertices, mesh.faces)
-    area = np.linalg.norm(normals, axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    points = points_on_faces(mesh.vertices[mesh.faces], face, rng)
-    return points + noise * rng.standard_normal(points.shape), normals[face] / area[face, None]
+    points, normals = sample_surface(mesh.vertices, mesh.faces, count, rng)
+    return points + noise * rng.standard_normal(points.shape), normals
 
 
 def view_scan(

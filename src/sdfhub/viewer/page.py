@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.up_axis import turned_up
 from sdfhub.space import Space
 from sdfhub.viewer.dropped_scan import FORMATS, fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
@@ -150,8 +151,8 @@ class Viewer:
         scene, up = self.server.scene, self.space.up
         scene.set_up_direction(f"+{up}")
         camera = self.server.initial_camera
-        camera.position, camera.look_at, camera.fov = *turned(EYE_AND_AIM, up), 0.66
-        plane, (below,) = {"z": "xy", "y": "xz"}[up], turned([[0, 0, -1]], up)
+        camera.position, camera.look_at, camera.fov = *turned_up(EYE_AND_AIM, "z", up), 0.66
+        plane, (below,) = {"z": "xy", "y": "xz"}[up], turned_up([[0, 0, -1]], "z", up)
         faint = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
         scene.add_grid("/floor", 8, 8, plane=plane, position=below, **faint)
         nothing = np.zeros((3, 3))
@@ -191,11 +192,6 @@ class Viewer:
 def moved(code: Tensor, axes: Tensor, steps: Sequence[float]) -> Tensor:
     """A code [L] moved by steps along axes [K, L]."""
     return code + torch.tensor(steps, dtype=code.dtype, device=code.device) @ axes
-
-
-def turned(places: Sequence[Sequence[float]], up: str) -> list[tuple[float, ...]]:
-    """Places of a world whose z points up, in one whose `up` does."""
-    return [(x, y, z) if up == "z" else (x, z, -y) for x, y, z in places]
 
 
 def bounded(value: float, low: float, high: float) -> float:

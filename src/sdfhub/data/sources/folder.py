@@ -11,7 +11,6 @@ from sdfhub.data.sources.mesh_files import FORMATS, buffer_path, read_mesh
 from sdfhub.data.sources.source import (
     Shape,
     Source,
-    Triangles,
     absolute,
     folder_safe,
     name_of_root,
@@ -19,6 +18,7 @@ from sdfhub.data.sources.source import (
 )
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Mesh
 from sdfhub.whole_file import file_sha256
 
 
@@ -79,7 +79,7 @@ class FolderSource(Source):
         ]
         return with_roles(found, self.train_split, self.test_split)
 
-    def load(self, shape: Shape) -> Triangles:
+    def load(self, shape: Shape) -> Mesh:
         if not self._files:
             self._files = self._by_id()
         return read_mesh(self._files[shape.id])

@@ -12,8 +12,9 @@ import numpy as np
 
 from sdfhub.data.sources.furniture import furniture_in, read_model
 from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
-from sdfhub.data.sources.source import Shape, Source, Triangles, folder_safe, plain_categories
+from sdfhub.data.sources.source import Shape, Source, folder_safe, plain_categories
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.shapes import Mesh
 from sdfhub.triangles import face_normals
 from sdfhub.whole_file import write_whole
 
@@ -40,7 +41,7 @@ class _Model:
             raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft")
         return self.file.read_bytes()
 
-    def triangles(self) -> Triangles:
+    def triangles(self) -> Mesh:
         name = self.member or self.file.name
         return triangles_of(self.content(), Path(name).suffix.lower(), f"{self.file.name}: {name}")
 
@@ -91,7 +92,7 @@ class OpenSource(Source):
             raise SdfhubError(f"data.source.root={self.root}: {what}")
         return sorted(shapes, key=lambda shape: shape.id)
 
-    def load(self, shape: Shape) -> Triangles:
+    def load(self, shape: Shape) -> Mesh:
         if shape.id not in self._models:
             self.shapes()
         return self._models[shape.id].triangles()

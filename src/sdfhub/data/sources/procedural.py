@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 
 from sdfhub import procedural
-from sdfhub.data.sources.source import Shape, Source, Triangles, plain_categories
+from sdfhub.data.sources.source import Shape, Source, plain_categories
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Mesh
 
 
 class ProceduralSource(Source):
@@ -35,5 +36,5 @@ class ProceduralSource(Source):
             for index in range(self.count)
         ]
 
-    def load(self, shape: Shape) -> Triangles:
+    def load(self, shape: Shape) -> Mesh:
         return procedural.generate(shape.category, int(shape.id.rpartition("/")[2]))

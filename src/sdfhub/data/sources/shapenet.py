@@ -7,7 +7,6 @@ from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.sources.source import (
     Shape,
     Source,
-    Triangles,
     absolute,
     folder_safe,
     name_of_root,
@@ -16,6 +15,7 @@ from sdfhub.data.sources.source import (
 )
 from sdfhub.data.sources.split_file import with_roles
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Mesh
 
 LAYOUTS = ("models/model_normalized.obj", "model.obj")
 """Where a model's mesh lies in its folder: version 2, version 1."""
@@ -54,7 +54,7 @@ class ShapeNetSource(Source):
         found = [pair for name in sorted(self.synsets) for pair in self._models(name)]
         return with_roles(found, self.train_split, self.test_split)
 
-    def load(self, shape: Shape) -> Triangles:
+    def load(self, shape: Shape) -> Mesh:
         folder = self.root / self.synsets[shape.category] / shape.credits["title"]
         return read_mesh(_mesh_file(folder) or folder)
 

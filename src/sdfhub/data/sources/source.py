@@ -10,13 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import ShapeSamples, check_id
-
-Triangles = tuple[np.ndarray, np.ndarray]
-"""vertices [V, 3] float64 and faces [F, 3] int64 in the source's own frame."""
+from sdfhub.shapes import Mesh, ShapeSamples, check_id
 
 
 @dataclass(frozen=True)
@@ -70,7 +65,7 @@ class Source(ABC):
         """
 
     @abstractmethod
-    def load(self, shape: Shape) -> Triangles | ShapeSamples:
+    def load(self, shape: Shape) -> Mesh | ShapeSamples:
         """The mesh of one shape in its source's frame, or its samples where the source holds no mesh.
 
         Raises:
