@@ -100,6 +100,8 @@ NORMALIZED = Frame(np.zeros(3), 1.0)
 class _InFrame:
     """Centre and scale of data with a frame."""
 
+    frame: Frame
+
     @property
     def center(self) -> np.ndarray:
         """[3] float64, source units; `source = normalised / scale + center`."""

@@ -223,5 +223,5 @@ def _crossed_neighbours(active: np.ndarray, blocks: np.ndarray, outside: np.ndar
         neighbours[:, axis + 1] += step
         within = (neighbours[:, axis + 1] >= 0) & (neighbours[:, axis + 1] < active.shape[-1])
         crossed.append(neighbours[within])
-    crossed = np.concatenate(crossed)
-    return np.unique(crossed[~active[tuple(crossed.T)]], axis=0)
+    behind = np.concatenate(crossed)
+    return np.unique(behind[~active[tuple(behind.T)]], axis=0)

@@ -84,19 +84,19 @@ class Grid:
         """A mesh in grid steps as one in the normalised frame."""
         return Mesh(vertices.astype(np.float64) * self.step - self.bound, faces.astype(np.int64))
 
-    def _points(self, keys: np.ndarray) -> torch.Tensor:
-        keys = torch.from_numpy(keys).to(self.device)
+    def _points(self, tiles: np.ndarray) -> torch.Tensor:
+        keys = torch.from_numpy(tiles).to(self.device)
         column = keys // self.n
         i = column // self.n
         return self.axis[torch.stack([i, column - i * self.n, keys - column * self.n], dim=-1)]
 
     @torch.no_grad()  # not inference_mode: tensors that a field caches must stay usable in training
     def _call(self, points: torch.Tensor, shapes: np.ndarray) -> np.ndarray:
-        values = self.fields(points, torch.from_numpy(shapes).to(self.device))
-        if values.shape != points.shape[:2]:
+        field = self.fields(points, torch.from_numpy(shapes).to(self.device))
+        if field.shape != points.shape[:2]:
             wanted = list(points.shape[:2])
-            raise ValueError(f"field: expected one value per point, {wanted}, got {list(values.shape)}")
-        values = values.detach().float().cpu().numpy()
+            raise ValueError(f"field: expected one value per point, {wanted}, got {list(field.shape)}")
+        values = field.detach().float().cpu().numpy()
         if not np.isfinite(values).all():
             bad = np.count_nonzero(~np.isfinite(values))
             raise SdfhubError(f"field: {bad} of {values.size} values are not finite; did training diverge?")

@@ -10,8 +10,11 @@ from functools import lru_cache
 import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
 
-Point = Sequence[float]
+Point = Sequence[float] | np.ndarray
 """x, y, z."""
+
+Profile = Sequence[tuple[float, float]] | np.ndarray
+"""(radius, height) of a turned part."""
 
 
 def union(parts: Sequence[Manifold]) -> Manifold:
@@ -131,12 +134,12 @@ def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold
     return sweep(np.array([start, end], float), section)
 
 
-def turned(start: Point, end: Point, profile: Sequence[tuple[float, float]]) -> Manifold:
+def turned(start: Point, end: Point, profile: Profile) -> Manifold:
     """A lathe-turned bar: `profile` holds (radius, height), height from 0 at start to 1 at end."""
     return _along(lathe(profile, 18, stretch=False), start, end)
 
 
-def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, stretch: bool = True) -> Manifold:
+def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifold:
     """A solid of revolution around z.
 
     Args:
@@ -144,10 +147,9 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, stretch: b
         segments: sides of the circle.
         stretch: let the polygon's area equal the circle's, so that few sides do not shrink it.
     """
-    profile = np.asarray(profile, float)
     turn = 2 * np.pi / segments
     ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
-    rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in profile]
+    rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in np.asarray(profile, float)]
     return loft(np.array(rings))
 
 
@@ -211,7 +213,7 @@ def spokes(count: int, first: float = -0.5) -> list[np.ndarray]:
     return [np.array([np.cos(angle), np.sin(angle), 0]) for angle in turns]
 
 
-def scaled(profile: Sequence[tuple[float, float]], radius: float, length: float = 1.0) -> list:
+def scaled(profile: Profile, radius: float, length: float = 1.0) -> list:
     """A profile (radius, height) whose numbers are given in shares of `radius` and `length`."""
     return [(radius * share, length * along) for share, along in profile]
 

@@ -96,7 +96,7 @@ def superellipse(segments: int, power: float) -> np.ndarray:
 class Station:
     """One section of a lifting surface: leading edge, chord, and the roll of its thickness (0: a wing's)."""
 
-    leading_edge: tuple[float, float, float]
+    leading_edge: parts.Point
     chord: float
     roll: float = 0.0
 
