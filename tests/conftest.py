@@ -16,7 +16,7 @@ def several(request):
 
 
 UNREPAIRED = (Path(__file__).parent / "unrepaired.txt").read_text().split()
-"""Tests that were written before the rooms of the house were rebuilt and do not pass since: to be repaired."""
+"""Tests of before the rebuilding of the rooms that do not pass since: to be repaired."""
 
 
 def pytest_ignore_collect(collection_path):

@@ -162,11 +162,11 @@ def test_frames_come_from_the_data_of_the_experiment(config, tmp_path):
     assert space.frames["chairs/aaa"].center.tolist() == [1, 0, -2] and space.frames["chairs/aaa"].scale == 4
 
 
-def test_without_its_split_shapes_are_numbered_and_another_split_can_be_given(config, tmp_path, capsys):
+def test_without_its_split_shapes_are_numbered_and_another_split_can_be_given(config, tmp_path, caplog):
     write_experiment(tmp_path)
     split = (tmp_path / "examples" / "splits" / "train.json").rename(tmp_path / "elsewhere.json")
     assert imported(config, tmp_path).ids == ("shape/00000", "shape/00001", "shape/00002")
-    assert "give split=" in capsys.readouterr().out
+    assert "give split=" in caplog.text
     again = imported(config, tmp_path, split=str(split), out=str(tmp_path / "again"))
     assert again.ids == tuple(IDS)
 

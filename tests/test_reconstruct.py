@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from sdfhub.checkpoint_file import LAST, write_checkpoint
+from sdfhub.checkpoint_file import LAST, read_checkpoint, write_checkpoint
 from sdfhub.composition import plain
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import begin_run
@@ -260,7 +260,6 @@ def test_plain_words_name_the_run_and_the_scans(run, scans, tmp_path, monkeypatc
 
 MISTAKES = {
     "frame=metres": ["frame", "metres"],
-    "fit=newton": ["newton", "deepsdf"],
     "fit.nearest=-1": ["fit", "negative"],
     "evidence.cells=2": ["evidence", "cells"],
     "resolution=1": ["resolution=1"],
@@ -282,11 +281,20 @@ def test_a_mistake_is_one_line_that_names_it(run, scans, override, monkeypatch, 
     assert message.startswith("sdfhub: error: ") and all(word in message for word in MISTAKES[override])
 
 
+def test_a_fit_that_is_not_there_is_refused_with_those_that_are(run, scans, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={run}", f"scans={scans}", "fit=newton"])
+    with pytest.raises(SystemExit) as stop:
+        task.main()
+    message = capsys.readouterr().err
+    assert stop.value.code == 1 and "Traceback" not in message
+    assert all(word in message for word in ("fit/newton", "deepsdf", "gauss_newton"))
+
+
 def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch, capsys):
     other = tmp_path / "other"
     begin_run(other, {"seed": 0, "model": {}}, ["a"], [], {}, "z")
-    (other / "checkpoints").mkdir()
-    (other / "checkpoints" / "last.ckpt").write_bytes((run / "checkpoints" / "last.ckpt").read_bytes())
+    weights = read_checkpoint(run / "checkpoints" / LAST)["state_dict"]
+    write_checkpoint({"state_dict": weights}, other / "checkpoints" / LAST)
     monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"scans={scans / 'bare.npy'}"])
     with pytest.raises(SystemExit) as stop:
         task.main()

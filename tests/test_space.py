@@ -9,12 +9,12 @@ import struct
 import numpy as np
 import pytest
 import torch
-import yaml
 from safetensors.torch import save_file
 
 import sdfhub
 import sdfhub.latent.gaussian
 import sdfhub.space
+from sdfhub.checkpoint_file import LAST, read_checkpoint, write_checkpoint
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import FORMAT, write_space
 from sdfhub.shapes import Frame
@@ -193,7 +193,7 @@ def test_principal_directions_are_orthogonal_and_as_long_as_codes_spread_along_t
         (lambda space: next(space.meshes(IDS[0])), "takes several shapes"),
         (lambda space: next(space.meshes(space.codes[0])), "takes several shapes"),
         (lambda space: space.interpolate(IDS[:2], 1, 3), "expected one shape, got several"),
-        (lambda space: space.fit(on_axis(1), frame="unknown"), "frame='unknown': must be 'shape'"),
+        (lambda space: space.fit(POINTS, frame="unknown"), "frame='unknown': must be 'shape'"),
         (lambda space: space.interpolate(0, 1, 2.5), "steps=2.5: must be a whole number"),
         (lambda _: sdfhub.load(None), "load takes the path"),
         (lambda _: sdfhub.prepare_mesh("chair.obj"), "prepare_mesh takes a trimesh.Trimesh"),
@@ -302,8 +302,10 @@ def changed(space, change) -> tuple[dict, dict]:
 STRANGERS = {
     "another class": (lambda a, t: a["model"]["decoder"].update(_target_="os.system"), "os.system"),
     "a class of another part": (
-        lambda a, t: a["model"]["decoder"]["encoding"].update(_target_="sdfhub.model.codes.CodeTable"),
-        "not a class of sdfhub.model.encodings",
+        lambda a, t: a["model"]["decoder"].update(
+            encoding={"_target_": "sdfhub.model.codes.CodeTable", "shapes": 4, "size": 3}
+        ),
+        "encoding must be a torch.nn.Module",
     ),
     "an unknown setting": (lambda a, t: a["model"]["decoder"].update(evil=1), "decoder.evil"),
     "a decoder without end": (
@@ -326,8 +328,8 @@ STRANGERS = {
     "a number that is none": (lambda a, t: a["model"]["decoder"].update(width="wide"), "decoder.width"),
     "no decoder": (lambda a, t: a["model"].pop("decoder"), "not a shape space"),
     "an activation that is no recipe": (
-        lambda a, t: a["model"]["decoder"]["activation"].update(_partial_=False),
-        "describes no decoder",
+        lambda a, t: a["model"]["decoder"].update(activation="sine"),
+        "describes no model|decoder.activation",
     ),
     "a model that is a list": (lambda a, t: a.update(model=[]), "not a shape space"),
     "another width": (lambda a, t: a["model"]["decoder"].update(width=31), "another model"),
@@ -395,9 +397,9 @@ def test_a_strangers_run_folder_runs_no_code(run, tmp_path):
         sdfhub.load(stranger)
     for decoder in ({"_target_": "os.system"}, {"width": 10**9}):
         other = shutil.copytree(run, tmp_path / f"other{len(str(decoder))}")
-        config = yaml.safe_load((other / "config.yaml").read_text())
-        config["decoder"] |= decoder
-        (other / "config.yaml").write_text(yaml.safe_dump(config))
+        checkpoint = read_checkpoint(run / "checkpoints" / LAST)
+        checkpoint["hyper_parameters"]["decoder"] |= decoder
+        write_checkpoint(checkpoint, other / "checkpoints" / LAST)
         with pytest.raises(SdfhubError, match=str(other)):
             sdfhub.load(other)
     assert not canary.exists()

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 
@@ -192,11 +192,11 @@ def check(value: Any, hint: Any, key: str) -> Any:
     Raises:
         SdfhubError: it is no such value.
     """
+    lenient = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
     try:
-        lenient = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
         adapter = TypeAdapter(hint, config=lenient)
-    except Exception:  # pydantic knows no such annotation
-        return value
+    except PydanticUserError:  # a model of pydantic has a config of its own
+        adapter = TypeAdapter(hint)
     try:
         return adapter.validate_python(value)
     except ValidationError as error:

@@ -17,7 +17,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -27,13 +27,15 @@ from safetensors.torch import save
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, read_checkpoint
-from sdfhub.data.loading import SdfDataModule
 from sdfhub.described import built
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
 from sdfhub.shapes import Frame
 from sdfhub.space import Space
 from sdfhub.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from sdfhub.data.loading import SdfDataModule
 
 FORMAT = "sdfhub space 2"
 """What an exported file says it is; another number where its content means something else."""
@@ -131,12 +133,14 @@ def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
     return config, split
 
 
-def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> SdfDataModule:
+def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> "SdfDataModule":
     """The data that a run's config describes.
 
     Raises:
         SdfhubError: it describes none, or names a class of a package that is not trusted.
     """
+    from sdfhub.data.loading import SdfDataModule  # here: it needs Lightning, and a space does not
+
     if "data" not in config:
         raise SdfhubError("the run's config.yaml says nothing of its data")
     data = built(with_environment(config["data"]), "data", trust, within="sdfhub.data")

@@ -34,9 +34,8 @@ class GaussNewtonFit:
     the training codes, draws from their distribution, and the training codes nearest to the observation. With
     an unknown pose: as many turns of it, each with the training code nearest then, the best ones.
 
-    Signed samples say where the surface is: they have DeepSDF's prior, N(0, 1) in every direction, and in a
-    known frame the mean alone is a start as good as many. What scans leave open, the distribution of the
-    training codes decides.
+    Signed samples say where the surface is, and have DeepSDF's prior, N(0, 1) in every direction. What scans
+    leave open, the distribution of the training codes decides.
 
     Args:
         samples: signed samples that an observation of a stored shape should hold, >= 1.
@@ -45,8 +44,8 @@ class GaussNewtonFit:
         weight_partial: the same for scans of only a part of the surface, >= 0.
         shrinkage: share of the isotropic covariance in that distribution, 1e-4 to 1: with less, few codes
             leave a covariance that float32 cannot invert.
-        random: draws from that distribution to start from, for scans, >= 0.
-        nearest: training codes to start from, for scans, by their violation on `probes` rows, >= 0.
+        random: draws from that distribution to start from, >= 0.
+        nearest: training codes to start from, by their violation on `probes` rows, >= 0.
         probes: rows that training codes, and turns of an unknown pose, are compared on, >= 1.
         thinning: starts see every so many-th row, the best of them then every root of it, then all, >= 1.
         steps: most steps of a descent, >= 1.
@@ -127,11 +126,8 @@ class GaussNewtonFit:
         """Turns [B, K] and unknowns [B, K, U] to descend from; `blind` codes are for every shape."""
         shapes = len(rows.soft)
         if not problem.has_pose:
-            if (rows.prior == EXACT).all():
-                starts = blind[:1].expand(shapes, -1, -1)
-            else:
-                _, near = self._nearest(problem, codes, rows, self.nearest)
-                starts = torch.cat([blind.expand(shapes, -1, -1), near], 1)
+            _, near = self._nearest(problem, codes, rows, self.nearest)
+            starts = torch.cat([blind.expand(shapes, -1, -1), near], 1)
             turn = torch.zeros(starts.shape[:2], dtype=torch.int64, device=codes.device)
             return turn, problem.unknowns(starts)
         near = [self._nearest(problem, codes, rows.turned(turn), 1) for turn in problem.turns]

@@ -116,11 +116,11 @@ class SdfLoss(Loss):
         tau_start: share of training in [0, 1) before which tau is 0: normals cost time before they pay.
     """
 
-    delta: PositiveFloat
-    lambda_code: NonNegativeFloat
-    code_norm: Literal["squared", "l2"]
-    warmup: Share
-    tau: NonNegativeFloat
+    delta: PositiveFloat = 0.1
+    lambda_code: NonNegativeFloat = 1e-4
+    code_norm: Literal["squared", "l2"] = "squared"
+    warmup: Share = 0.05
+    tau: NonNegativeFloat = 0.01
     tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
     def wants_gradients(self, progress: float) -> bool:

@@ -62,8 +62,8 @@ class Optimisation:
             of one. Its fused implementation is taken where it has one.
     """
 
-    lr_decoder: PositiveFloat
-    lr_codes: PositiveFloat
+    lr_decoder: PositiveFloat = 2e-3
+    lr_codes: PositiveFloat = 5e-3
     schedule: Schedule | None = None
     warmup_steps: NonNegativeInt = 0
     optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, write_checkpoint
@@ -108,7 +108,12 @@ def read_specs(path: Path) -> Specs:
         raise SdfhubError(f"{path}: not an experiment of DeepSDF's ({error.strerror})") from error
     except (ValueError, RecursionError) as error:
         raise SdfhubError(f"{path}: not JSON: {error}") from error
-    specs = check(content, Specs, str(path))
+    try:
+        specs = Specs.model_validate(content)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        key = ".".join(map(str, wrong["loc"]))
+        raise SdfhubError(f"{path}: {key}: {wrong['msg'].lower()}") from error
     network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
     refusals = {
         "NetworkArch": specs.NetworkArch != "deep_sdf_decoder" and "only deep_sdf_decoder is known",

@@ -2,9 +2,12 @@
 
 import threading
 from pathlib import Path
+from typing import Annotated
 
 from omegaconf import DictConfig
+from pydantic import Field
 
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import load
 from sdfhub.tasks.app import run_task
@@ -12,8 +15,8 @@ from sdfhub.tasks.app import run_task
 
 def view(config: DictConfig) -> None:
     """The task: `config` as conf/view.yaml has it. Returns when the process is interrupted."""
-    if not 0 <= config.port <= 65535 or not 8 <= config.resolution <= 512:
-        raise SdfhubError(f"port={config.port}, resolution={config.resolution}: 0 to 65535, and 8 to 512")
+    check(config.port, Annotated[int, Field(ge=0, le=65535)], "port")
+    check(config.resolution, Annotated[int, Field(ge=8, le=512)], "resolution")
     try:
         from sdfhub.viewer.page import Viewer
     except ImportError as error:
