@@ -74,7 +74,7 @@ def time_judge(count: int) -> None:
 def time_evaluation(space: Path, resolution: int, shapes: int) -> None:
     command = [sys.executable, "-m", "sdfhub", "evaluate", f"run={space}"]
     with tempfile.TemporaryDirectory() as out:
-        command += [f"evaluate.resolution={resolution}", f"evaluate.known={shapes}"]
+        command += [f"evaluate.resolution={resolution}", f"evaluate.train={shapes}"]
         command += ["evaluate.held_out=0", f"out={out}"]
         start = time.perf_counter()
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)

@@ -105,7 +105,7 @@ def main() -> None:
     torch.set_num_threads(1)
     if (space := arguments.space) is None:
         name = f"fitting_{arguments.experiment}"
-        settings = ["scale=cpu_200", "callbacks=none", "evaluate.known=1", "evaluate.held_out=0"]
+        settings = ["scale=cpu_200", "callbacks=none", "evaluate.train=1", "evaluate.held_out=0"]
         train(name, f"experiment={arguments.experiment}", *settings)
         space = ROOT / "outputs" / "benchmarks" / name
     compare(

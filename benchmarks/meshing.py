@@ -38,7 +38,7 @@ SMALL = [
     "data.held_out=0",
     "data.preparation.samples=50000",
     "callbacks=none",
-    "evaluate.known=0",
+    "evaluate.train=0",
 ]
 ROUGH = 10  # shapes compared of a space that is no trained category
 CATEGORIES = ("chairs", "lamps", "planes", "sofas", "tables")

@@ -31,7 +31,7 @@ class Ball(FakeShape):
     def mesh(self) -> NormalizedMesh | None:
         ball = trimesh.creation.icosphere(3, self.radius)
         faces = np.asarray(ball.faces, np.int64)
-        return NormalizedMesh(np.array(ball.vertices), faces, np.zeros(3), 1.0) if self.has_mesh else None
+        return NormalizedMesh(np.array(ball.vertices), faces) if self.has_mesh else None
 
 
 class Item(NamedTuple):

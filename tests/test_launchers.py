@@ -13,7 +13,7 @@ from tests.stand_in_training import CONF
 
 ROOT = Path(__file__).parents[1]
 SHORT = ["sweeps=smoke", "experiment=fft_siren", "seed=0", "trainer.max_epochs=1", "evaluate.held_out=0"]
-SHORT += ["evaluate.known=0", "data.preparation.samples=2000", "data.preparation.surface_points=500"]
+SHORT += ["evaluate.train=0", "data.preparation.samples=2000", "data.preparation.surface_points=500"]
 
 
 def begun(*words: str, **environment: str) -> subprocess.Popen:
@@ -31,7 +31,7 @@ def root(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def places(root) -> list[str]:
-    return [f"output_root={root / 'outputs'}", f"data.store={root / 'store'}"]
+    return [f"paths.output={root / 'outputs'}", f"data.store={root / 'store'}"]
 
 
 @pytest.fixture(scope="module")

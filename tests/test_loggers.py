@@ -31,7 +31,7 @@ POLE = trimesh.creation.cylinder(0.1, 1.0)
 
 def of_group(choice: str, folder: Path, *overrides: str) -> list:
     """The loggers of a choice of the group `logger`."""
-    words = [f"logger={choice}", f"hydra.runtime.output_dir={folder}", f"output_root={folder}"]
+    words = [f"logger={choice}", f"hydra.runtime.output_dir={folder}", f"paths.output={folder}"]
     return [instantiate(node) for node in composed(*words, *overrides)["logger"].values()]
 
 

@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import trimesh
 import yaml
+from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
 from sdfhub.errors import SdfhubError
@@ -113,10 +114,10 @@ def test_a_shape_without_a_surface_counts_with_its_penalty_and_is_counted(tmp_pa
 
 
 def test_rows_print_the_settings_in_which_they_differ_and_whether_they_were_searched(tmp_path):
-    config = {"activation": {"omega": 5}, "decoder": {"activation": {"omega": 5}}, "output_root": "x"}
+    config = {"activation": {"omega": 5}, "decoder": {"activation": {"omega": 5}}, "paths": {"output": "x"}}
     write_cell(tmp_path, planned("SIREN"), [0.1e-3], config=config | {"searched": "16 trials | scale=demo"})
     config = {"activation": {"omega": 7}, "decoder": {"activation": {"omega": 7}}, "loss": {"delta": 0.1}}
-    write_cell(tmp_path, planned("FFT/SIREN"), [0.1e-3], config=config | {"output_root": "y"})
+    write_cell(tmp_path, planned("FFT/SIREN"), [0.1e-3], config=config | {"paths": {"output": "y"}})
     enter_cells(tmp_path, [planned("FFT/HOSC")])
     found = tables_of(only_group(tmp_path))
     assert found["Settings that differ"].reset_index().to_numpy().tolist() == [
@@ -266,7 +267,12 @@ def test_rows_of_one_method_are_told_apart_by_what_the_command_line_says(tmp_pat
 def test_seeds_trained_under_other_defaults_are_rows_of_their_own(tmp_path):
     """A new version's defaults change a cell that the same command line asks for."""
     for seed, tau in ((0, 0.088), (1, 0.0126), (2, 0.0126)):
-        config = {"seed": seed, "normals": {"tau": tau}, "loss": {"tau": tau}, "output_root": f"o{seed}"}
+        config = {
+            "seed": seed,
+            "normals": {"tau": tau},
+            "loss": {"tau": tau},
+            "paths": {"output": f"o{seed}"},
+        }
         write_cell(tmp_path, planned("FFT/SIREN", seed=seed), [1e-3 * (seed + 1)], config=config)
     enter_cells(tmp_path, [planned("FFT/SIREN", seed=3)])
     group = only_group(tmp_path)
@@ -451,7 +457,7 @@ def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monk
 
 def test_what_is_no_sweep_is_one_line_and_gets_no_folder(tmp_path):
     with pytest.raises(SdfhubError, match="not the folder of a multirun"):
-        report_task.report({"sweep": str(tmp_path / "nothere"), "out": None, "shapes": 2})
+        report_task.report(OmegaConf.create({"sweep": str(tmp_path / "nothere"), "out": None, "shapes": 2}))
     assert not list(tmp_path.iterdir())
     (tmp_path / PLAN).write_text("{}}")
     with pytest.raises(SdfhubError, match=r"sweep\.json"):

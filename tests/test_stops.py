@@ -23,11 +23,11 @@ def overrides(tmp_path: Path, folder: Path, epochs: int = 30) -> list[str]:
         "data.held_out=0",
         "data.loader.passes_per_epoch=10",
         "callbacks=quiet",
-        "evaluate.known=1",
+        "evaluate.train=1",
         "trainer=cpu",
         f"trainer.max_epochs={epochs}",
         f"data.store={tmp_path / 'store'}",
-        f"output_root={tmp_path / 'outputs'}",
+        f"paths.output={tmp_path / 'outputs'}",
         f"hydra.run.dir={folder}",
     ]
 
@@ -92,7 +92,7 @@ def test_a_job_that_slurm_queues_again_goes_on(undisturbed, tmp_path):
     (tmp_path / "scontrol").write_text(f"#!/bin/sh\necho $* >> {tmp_path}/asked\n")
     (tmp_path / "scontrol").chmod(0o755)
     slurm = {"SLURM_JOB_ID": "4711", "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    words = [*overrides(root, root)[:-2], f"output_root={tmp_path / 'outputs'}"]
+    words = [*overrides(root, root)[:-2], f"paths.output={tmp_path / 'outputs'}"]
     process = begun(words, tmp_path, **slurm)
     process.send_signal(signal.SIGUSR1)
     told, _ = process.communicate(timeout=60)

@@ -22,7 +22,7 @@ def smoke_command(root: Path) -> list[str]:
         str(ROOT / "train.py"),
         "-m",
         "sweeps=smoke",
-        f"output_root={root / 'outputs'}",
+        f"paths.output={root / 'outputs'}",
         f"data.store={root / 'store'}",
     ]
 

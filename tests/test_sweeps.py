@@ -72,7 +72,7 @@ def test_a_cells_folder_tells_every_setting_that_decides_its_result():
     first = folder()
     assert first.startswith("procedural_chairs_deepsdf_") and "_seed-0_" in first
     assert first in {cell.folder for cell in cells("sweeps=smoke")}, "a seed said or left out"
-    watched = ("output_root=elsewhere", "data.workers=1", "trainer.accelerator=cpu", "callbacks=default")
+    watched = ("paths.output=elsewhere", "data.workers=1", "trainer.accelerator=cpu", "callbacks=default")
     assert folder(*watched, "+hint=${hydra:runtime.output_dir}") != first
     assert folder(*watched) == first
     stops = (
