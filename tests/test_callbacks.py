@@ -110,9 +110,10 @@ def test_shapes_without_mesh_are_skipped_and_fields_without_surface_are_counted(
 
 
 def test_chamfer_distances_are_in_the_unit_of_the_tables():
-    trained(small_meshes(1), model=BallModel(0.1, rate=0.0), logger=(kept := Kept()), max_epochs=1)
+    meshes = MeshShapes(times=1, shapes=2, resolution=24, points=5000)
+    trained(meshes, model=BallModel(0.1, rate=0.0), logger=(kept := Kept()), max_epochs=1)
     (cd,) = [value for name, value, _ in kept.scalars if name == "mesh/cd"]
-    assert 10 < cd < 60, "both balls are 0.1 too large: 2 * 0.1^2 and the noise of 50 points, times 10^3"
+    assert 18 < cd < 23, "both balls are 0.1 too large: 2 * 0.1^2, times 10^3, and little noise"
 
 
 def test_the_record_counts_neither_pictures_nor_validation():

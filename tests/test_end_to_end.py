@@ -128,7 +128,7 @@ def test_meshes_are_written_in_their_sources_frame(trained):
 def test_tensorboard_has_every_curve_picture_and_mesh(trained):
     events = EventAccumulator(str(trained[0] / "tensorboard"))
     events.Reload()
-    wanted = ["loss/sdf", "loss/code", "loss/normal", "loss/total", "lr/decoder", "lr/codes", "codes/norm"]
+    wanted = ["loss/sdf", "loss/code", "loss/normal", "loss/total", "lr-Adam/decoder", "lr-Adam/codes", "codes/norm"]
     wanted += ["beta/layer_0", "omega/layer_0", "speed/samples_per_second", "mesh/cd", "mesh/failed"]
     assert set(wanted) <= set(events.Tags()["scalars"])
     assert any("slice" in tag for tag in events.Tags()["images"])

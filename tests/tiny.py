@@ -8,7 +8,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from sdfhub.checkpoint_file import read_checkpoint
 from sdfhub.composition import configuration_folder, instantiate
@@ -70,7 +70,8 @@ def composed(*words: str, config_name: str = "config") -> DictConfig:
     with initialize_config_dir(str(configuration_folder()), version_base="1.3"):
         config = compose(config_name, list(words), return_hydra_config=True)
     with open_dict(config):
-        config.hydra.runtime.output_dir = "unused"
+        if OmegaConf.is_missing(config.hydra.runtime, "output_dir"):
+            config.hydra.runtime.output_dir = "unused"
         HydraConfig.instance().set_config(config)
         del config["hydra"]
     return config
