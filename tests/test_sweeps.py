@@ -196,17 +196,17 @@ def test_scores_of_other_settings_or_broken_ones_do_not_count_as_finished(traini
 
 
 @pytest.mark.parametrize(
-    ("words", "answer"),
+    ("words", "answer", "status"),
     [
-        (["sweeps=smoke,table_small"], "sweeps=smoke,table_small: one sweep or search a command"),
-        (["sweeps=smoke", "hparams_search=siren"], "one sweep or search a command"),
-        (["sweeps=table_smal"], "table_small"),
-        (["sweeps=smoke", "seed=0,abc"], "seed"),
-        (["sweeps=smoke", "experiment=siren,sirenn"], "experiment/sirenn"),
+        (["sweeps=smoke,table_small"], "sweeps=smoke,table_small: one sweep or search a command", 2),
+        (["sweeps=smoke", "hparams_search=siren"], "one sweep or search a command", 2),
+        (["sweeps=table_smal"], "table_small", 1),  # Hydra's own refusal, as below
+        (["sweeps=smoke", "seed=0,abc"], "seed", 2),
+        (["sweeps=smoke", "experiment=siren,sirenn"], "experiment/sirenn", 1),
     ],
 )
-def test_a_multirun_that_cannot_be_is_refused_in_one_line(words, answer, training, capsys):
-    assert training.start("-m", *words) == 2
+def test_a_multirun_that_cannot_be_is_refused_before_a_cell_starts(words, answer, status, training, capsys):
+    assert training.start("-m", *words) == status
     told = capsys.readouterr().err
     assert answer in told and "Traceback" not in told and training.configs == []
 
