@@ -57,7 +57,7 @@ def ball(seed: int, rows: int = 300) -> ShapeSamples:
 
 
 def fill(root, source, **settings) -> Store:
-    settings = {"preparation": SETTINGS, "workers": 1, "progress": False} | settings
+    settings = {"preparation": SETTINGS, "workers": 1} | settings
     return prepare(source, source.shapes(), root=root, **settings)
 
 
@@ -167,7 +167,7 @@ def test_a_store_with_nothing_usable_is_an_error(tmp_path):
 
 def test_parts_are_prepared_apart_and_taken_over(tmp_path, loaded):
     source = Balls(5)
-    made = [prepare_part(source, source.listed[i::2], SETTINGS, tmp_path, 1, False) for i in (0, 1, 1)]
+    made = [prepare_part(source, source.listed[i::2], SETTINGS, tmp_path, 1) for i in (0, 1, 1)]
     assert made == [3, 2, 0]
     loaded.clear()
     assert len(fill(tmp_path, source)) == 5 and not loaded

@@ -44,7 +44,7 @@ def test_the_item_on_which_a_worker_dies_is_named_and_the_others_go_on():
 def test_workers_are_single_threaded_and_the_environment_here_stays(monkeypatch):
     monkeypatch.setenv(THREADS[0], "7")
     before = dict(os.environ)
-    results = dict(map_in_processes(variable, [*THREADS, *SAFE_PATH], workers=2))
+    results = dict(map_in_processes(variable, [*THREADS, SAFE_PATH], workers=2))
     assert set(results.values()) == {"1"} and dict(os.environ) == before
 
 

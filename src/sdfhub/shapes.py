@@ -6,7 +6,7 @@ in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,23 +18,18 @@ RADIUS = 1 / 1.03
 
 _PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
 SHAPE_ID = rf"^{_PART}(/{_PART})*$"
-"""Pattern of a shape's id: safe as a path below a folder, and none leads out of it."""
+"""Pattern of a shape's id, such as `chairs/0007`: safe as a path below a folder, and none leads out of it."""
 
 
 def check_id(id: str) -> None:
-    """Refuses an id that is not safe as a path below a folder, such as `chairs/0007` is.
-
-    Raises:
-        ValueError: lists the letters of an id.
-    """
+    """Raises ValueError for an id that is not safe as a path below a folder."""
     if not isinstance(id, str) or not re.fullmatch(SHAPE_ID, id):
         raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
 
 
-def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
-    fits = len(array.shape) == len(shape) and all(
-        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
-    )
+def _check(name: str, array: Any, shape: tuple[int | None, ...], dtype: Any) -> None:
+    fits = len(array.shape) == len(shape)
+    fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
     if not fits or array.dtype != dtype:
         raise ValueError(f"{name}: expected {list(shape)} {dtype}, got {list(array.shape)} {array.dtype}")
 
@@ -63,12 +58,10 @@ class Frame:
     center: np.ndarray
     scale: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("center", self.center, (3,), np.float64)
         if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(
-                f"frame: center must be finite and scale positive, got {self.center}, {self.scale}"
-            )
+            raise ValueError(f"frame: no finite center {self.center} and positive scale {self.scale}")
 
     @classmethod
     def around(cls, points: np.ndarray) -> tuple["Frame", np.ndarray]:
@@ -97,24 +90,22 @@ NORMALIZED = Frame(np.zeros(3), 1.0)
 """The frame of a shape that has no source: the normalised one itself."""
 
 
-class _InFrame:
-    """Centre and scale of data with a frame."""
+class InFrame:
+    """Data in a normalised frame, with the centre [3] and the scale of the way back to its source's."""
 
     frame: Frame
 
     @property
     def center(self) -> np.ndarray:
-        """[3] float64, source units; `source = normalised / scale + center`."""
         return self.frame.center
 
     @property
     def scale(self) -> float:
-        """Normalised units per source unit."""
         return self.frame.scale
 
 
 @dataclass(frozen=True)
-class NormalizedMesh(_InFrame):
+class NormalizedMesh(InFrame):
     """A triangle mesh in the normalised frame.
 
     Args:
@@ -127,18 +118,17 @@ class NormalizedMesh(_InFrame):
     faces: np.ndarray
     frame: Frame = NORMALIZED
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("vertices", self.vertices, (None, 3), np.float64)
         _check("faces", self.faces, (None, 3), np.int64)
-        reach = np.linalg.norm(self.vertices, axis=1).max(initial=0)
-        if not reach <= 1 + 1e-6:  # also where a vertex is not finite
+        if not np.linalg.norm(self.vertices, axis=1).max(initial=0) <= 1 + 1e-6:  # also where one is NaN
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise ValueError("faces: index a vertex that is not there")
 
 
 @dataclass(frozen=True)
-class ShapeSamples(_InFrame):
+class ShapeSamples(InFrame):
     """Signed distances and oriented surface points of one shape, normalised frame.
 
     Args:
@@ -159,7 +149,7 @@ class ShapeSamples(_InFrame):
     mesh: NormalizedMesh | None
     statistics: dict[str, float]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n, m = len(self.points), len(self.surface_points)
         shapes = {"points": (n, 3), "sdf": (n,), "surface_points": (m, 3), "surface_normals": (m, 3)}
         for name, shape in shapes.items():
@@ -175,14 +165,13 @@ class Observation:
     """Bounds on the signed distances of one shape at some points.
 
     A sample of the field has equal bounds; a point on the surface has 0 and 0; a point that a ray crossed
-    has 0 or more below; any point has its distance to the observed surface above. Where no side is known,
-    the bounds are those of the unsigned distance.
+    has 0 or more below; any point has its distance to the observed surface above.
 
     Args:
         points: [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity); in random order.
         low: [N] float32, least signed distance there.
         high: [N] float32, largest; high >= low.
-        unsigned: [N] bool, whether low and high bound the absolute value.
+        unsigned: [N] bool, whether low and high bound the absolute value, since no side is known.
         noise: standard deviation of the surface points, same frame, >= 0.
         partial: whether a part of the shape's surface was not seen.
     """
@@ -194,7 +183,7 @@ class Observation:
     noise: float = 0.0
     partial: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n = len(self.points)
         _check("points", self.points, (n, 3), np.float32)
         for name, dtype in (("low", np.float32), ("high", np.float32), ("unsigned", np.bool_)):
@@ -207,8 +196,7 @@ class Observation:
     @classmethod
     def of_samples(cls, points: np.ndarray, sdf: np.ndarray) -> "Observation":
         """Signed samples: points [N, 3] and their distances [N], in random order."""
-        sdf = np.ascontiguousarray(sdf, np.float32)
-        points = np.ascontiguousarray(points, np.float32)
+        sdf, points = np.ascontiguousarray(sdf, np.float32), np.ascontiguousarray(points, np.float32)
         return cls(points, sdf, sdf, np.zeros(len(sdf), np.bool_))
 
     @property
@@ -236,7 +224,7 @@ class Batch:
     surface_points: "torch.Tensor"
     surface_normals: "torch.Tensor"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         import torch  # here: meshes and samples do without it
 
         b, n = self.points.shape[:2]
@@ -246,6 +234,6 @@ class Batch:
         for name, count in (("points", n), ("surface_points", m), ("surface_normals", m)):
             _check(name, getattr(self, name), (b, count, 3), torch.float32)
 
-    def to(self, device, non_blocking: bool = False) -> "Batch":
+    def to(self, device: "torch.device | str", non_blocking: bool = False) -> "Batch":
         """The same batch on another device."""
         return Batch(*(getattr(self, f).to(device, non_blocking=non_blocking) for f in self.__match_args__))

@@ -34,7 +34,6 @@ from sdfhub.multirun.processes import ending_together, refuse_processes_in_multi
 from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
-from sdfhub.shapes import Frame
 from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
@@ -92,7 +91,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
         written | {"data": with_absolute_paths(written["data"])},
         train=ids,
         held_out=[shape.id for shape in parts.data.held_out_shapes],
-        frames={shape.id: Frame(shape.center, shape.scale) for shape in parts.data.train_shapes},
+        frames={shape.id: shape.frame for shape in parts.data.train_shapes},
         up=parts.data.train_shapes[0].up,
     )
     log.info("run: %s", folder)

@@ -10,15 +10,8 @@ ROOM = 50_000
 """Pieces that cutting may add: it pays where few triangles are long, and memory stays bounded."""
 
 
-def cut_long(
-    vertices: np.ndarray, faces: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
     """Triangles halved across their longest edge until none is longer than `longest`, or ROOM is used up.
-
-    Args:
-        vertices: [V, 3] float64.
-        faces: [F, 3] int64.
-        longest: edge length in the vertices' units.
 
     Returns:
         vertices [V + M, 3], faces [F + M, 3] that turn as the given ones do, and of each of these the row

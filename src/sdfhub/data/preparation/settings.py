@@ -1,9 +1,9 @@
 """How one mesh becomes signed samples: plain numbers, filled from YAML and hashed by the store."""
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from sdfhub.errors import SdfhubError
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic.dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -31,47 +31,30 @@ class Preparation:
         max_components: connected pieces.
         max_two_sided_area: share of the visible area that belongs to two-sided sheets.
         min_certain: share of the samples whose sign is certain (winding: |w - 0.5| > 0.25).
-        min_inside: share of the samples that lie inside.
-        max_inside: share of the samples that lie inside.
+        min_inside, max_inside: share of the samples that lie inside.
         max_contradictory: share of sightings on the less seen side of their face (sign=vote only).
         max_bad_faces: share of the visible area with over a tenth of its sightings there (sign=vote only).
     """
 
     sign: Literal["winding", "vote", "pseudo_normal"] = "winding"
-    samples: int = 500_000
-    near_share: float = 0.94
-    variances: tuple[float, ...] = (0.005, 0.0005)
-    surface_points: int = 30_000
-    views: int = 100
+    samples: PositiveInt = 500_000
+    near_share: Annotated[float, Field(ge=0, le=1)] = 0.94
+    variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
+    surface_points: NonNegativeInt = 30_000
+    views: Annotated[int, Field(ge=8)] = 100
     hidden_below: float = 0.04
     two_sided_above: float = 0.25
     drop_uncertain: bool = False
-    min_faces: int = 50
+    min_faces: NonNegativeInt = 50
     min_extent_ratio: float = 0.01
     max_zero_area: float = 0.3
-    max_components: int = 2000
+    max_components: PositiveInt = 2000
     max_two_sided_area: float = 0.25
     min_certain: float = 0.9
     min_inside: float = 0.005
     max_inside: float = 0.75
     max_contradictory: float = 0.02
     max_bad_faces: float = 0.03
-
-    def __post_init__(self):
-        object.__setattr__(self, "variances", tuple(self.variances))  # YAML gives a list
-        methods = "winding", "vote", "pseudo_normal"
-        for name, valid, wanted in (
-            ("sign", self.sign in methods, f"one of {', '.join(methods)}"),
-            ("samples", self.samples >= 1, "at least 1"),
-            ("near_share", 0 <= self.near_share <= 1, "within [0, 1]"),
-            ("variances", len(self.variances) > 0 and min(self.variances) > 0, "positive numbers"),
-            ("surface_points", self.surface_points >= 0, "at least 0"),
-            ("views", self.views >= 8, "at least 8"),
-            ("min_faces", self.min_faces >= 0, "at least 0"),
-            ("max_components", self.max_components >= 1, "at least 1"),
-        ):
-            if not valid:
-                raise SdfhubError(f"preparation.{name}={getattr(self, name)}: must be {wanted}")
 
 
 DEFAULT = Preparation()

@@ -50,11 +50,7 @@ SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs
 
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
-    """Exact unsigned distances to all faces, two-sided sheets included.
-
-    Args:
-        points: [N, 3] float64; fastest in `morton_order`.
-    """
+    """Exact unsigned distances to all faces, sheets too, of points [N, 3] float64; fastest in `morton_order`."""
     vertices, faces, source = cut_long(surface.vertices, surface.faces, NEAREST_EDGE)
     tree = igl.AABB()
     tree.init(vertices, faces)
@@ -148,10 +144,8 @@ def pseudo_normal_signs(
     inside = np.einsum("nj,nj->n", points - foot, normals[nearest.face]) < 0
     edge = share < 1e-6  # elsewhere the face's own normal decides, at no further cost
     if edge.any():
-        signed, *_ = igl.signed_distance(
-            points[edge], surface.vertices, surface.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        )
-        inside[edge] = signed < 0
+        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        inside[edge] = igl.signed_distance(points[edge], surface.vertices, surface.faces, kind)[0] < 0
     return Signs(inside, np.ones(len(points), bool))
 
 

@@ -7,7 +7,6 @@ Each shape's file is written beside its place and renamed. Files whose size or d
 checksum was compared are compared again, and prepared again where they are damaged.
 """
 
-import dataclasses
 import hashlib
 import json
 import logging
@@ -18,12 +17,16 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 from tqdm import tqdm
 
-from sdfhub.data.preparation.sampling import Preparation, prepare_mesh
+from sdfhub.data.preparation.sampling import prepare_mesh
+from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_of, write_shape
 from sdfhub.data.workers import Crashed, map_in_processes
@@ -41,8 +44,6 @@ INDEX = "index.json"
 
 TRIED_AGAIN = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
-
-_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{12}")
 
 
 class Store:
@@ -67,7 +68,9 @@ class Store:
             SdfhubError: no prepared shapes there, or a shape that was never prepared.
         """
         folder = Path(root)
-        there = _ids_in(folder)
+        files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
+        paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
+        there = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
         if not there:
             raise SdfhubError(f"{root}: holds no prepared shapes; run `sdfhub prepare` first")
         ids = there if ids is None else list(ids)
@@ -115,7 +118,6 @@ def prepare(
     preparation: Preparation,
     root: str | Path,
     workers: int | None = None,
-    progress: bool = True,
 ) -> Store:
     """The store holding `shapes`, preparing those that it lacks.
 
@@ -129,28 +131,24 @@ def prepare(
         preparation: the settings, part of the store's folder name.
         root: folder of all stores.
         workers: processes; None takes one per core, 1 works in this process.
-        progress: show a bar.
 
     Raises:
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
-    stored = _checked(folder, shapes, source)
+    about = {"source": source.name} | asdict(preparation)
+    stored = _checked(folder, shapes, source.up, about, logging.DEBUG)
     if _left(shapes, stored):
-        with _writing(folder), locked(folder / ".lock", waiting=f"store: {folder}: {_WAITING}"):
+        waiting = f"store: {folder}: waiting for another process that prepares it"
+        with _writing(folder), locked(folder / ".lock", waiting=waiting):
             _remove_leftovers(folder)
             # another process may have filled it meanwhile
-            left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
-            made: list[str] = []
-            try:
-                for shape, result in _prepared(source, left, preparation, folder, workers, progress):
-                    if isinstance(result, Crashed):
-                        write_shape(_file(folder, shape.id), {}, _rejection(shape, "crash", _CRASH))
-                    made.append(shape.id)
-            finally:  # a run that is interrupted keeps what it has
-                fresh = _read(folder, made, source.up)
-                _remember(folder, fresh, {"source": source.name} | dataclasses.asdict(preparation))
-        stored = _checked(folder, shapes, source)
+            left = _left(shapes, _checked(folder, shapes, source.up, about))
+            for shape, is_crash in _prepared(source, left, preparation, folder, workers):
+                if is_crash:
+                    what = "the worker process died: out of memory, or a fault in a native library"
+                    write_shape(_file(folder, shape.id), {}, _rejection(shape, "crash", what))
+        stored = _checked(folder, shapes, source.up, about)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
         what = "; ".join(line.strip() for line in store.summary().splitlines())
@@ -164,12 +162,8 @@ def prepare_part(
     preparation: Preparation,
     root: str | Path,
     workers: int | None = None,
-    progress: bool = True,
 ) -> int:
-    """Prepares some of a store's shapes; several processes or machines may do so side by side.
-
-    Args:
-        shapes: this part's own; the other arguments are those of `prepare`.
+    """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
 
     Returns:
         How many were prepared or rejected; the others were there, or are left to the next call, since
@@ -180,14 +174,14 @@ def prepare_part(
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
     with _writing(folder):
-        left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
-        results = _prepared(source, left, preparation, folder, workers, progress)
-        return sum(not isinstance(result, Crashed) for _, result in results)
+        left = _left(shapes, _checked(folder, shapes, source.up))
+        results = _prepared(source, left, preparation, folder, workers)
+        return sum(not is_crash for _, is_crash in results)
 
 
 def preparation_hash(preparation: Preparation) -> str:
     """12 hex digits that change with every setting of the preparation and with VERSION."""
-    settings = json.dumps([VERSION, dataclasses.asdict(preparation)], sort_keys=True)
+    settings = json.dumps([VERSION, asdict(preparation)], sort_keys=True)
     return hashlib.sha256(settings.encode()).hexdigest()[:12]
 
 
@@ -197,45 +191,33 @@ def shape_seed(shape: Shape | StoredShape) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def prepare_shape(source: Source, shape: Shape, preparation: Preparation, folder: Path) -> None:
+def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape: Shape) -> None:
     """Loads, samples and writes one shape, or the reason why it is rejected. Never raises for a bad mesh.
 
     Raises:
         OSError: the store cannot be written, which no other shape would survive either.
     """
-    start = time.perf_counter()
-    arrays = {}
+    start, seed = time.perf_counter(), shape_seed(shape)
+    arrays: dict[str, np.ndarray] = {}
     try:
         loaded = source.load(shape)
-        is_sampled = isinstance(loaded, ShapeSamples)
-        samples = loaded if is_sampled else prepare_mesh(loaded, preparation, shape_seed(shape))
-        arrays = arrays_of(samples, shape_seed(shape))
-        statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = Record(shape.fingerprint, shape.category, shape.credits, statistics=statistics)
-        center = tuple(samples.center.tolist())
-        record = dataclasses.replace(record, center=center, scale=float(samples.scale))
+        samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
+        arrays = arrays_of(samples, seed)
+        x, y, z = samples.center.tolist()
+        record = Record(
+            shape.fingerprint,
+            shape.category,
+            shape.credits,
+            center=(x, y, z),
+            scale=float(samples.scale),
+            statistics={name: float(value) for name, value in samples.statistics.items()},
+        )
     except RejectedMesh as rejection:
         record = _rejection(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
         record = _rejection(shape, "error", f"{type(error).__name__}: {error}")
     seconds = round(time.perf_counter() - start, 4)
-    write_shape(_file(folder, shape.id), arrays, dataclasses.replace(record, seconds=seconds))
-
-
-@dataclasses.dataclass(frozen=True)
-class _PrepareShape:
-    """`prepare_shape` with all but the shape filled in; pickles into worker processes."""
-
-    source: Source
-    preparation: Preparation
-    folder: Path
-
-    def __call__(self, shape: Shape) -> None:
-        prepare_shape(self.source, shape, self.preparation, self.folder)
-
-
-_WAITING = "waiting for another process that prepares it"
-_CRASH = "the worker process died: out of memory, or a fault in a native library"
+    write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
 def _rejection(shape: Shape, reason: str, detail: str) -> Record:
@@ -243,16 +225,18 @@ def _rejection(shape: Shape, reason: str, detail: str) -> Record:
     return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
 
 
-def _prepared(source, left, preparation, folder, workers, progress) -> Iterator[tuple[Shape, Crashed | None]]:
+def _prepared(
+    source: Source, left: list[Shape], preparation: Preparation, folder: Path, workers: int | None
+) -> Iterator[tuple[Shape, bool]]:
+    """Each shape when it is prepared, and whether its worker died on it."""
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
-    function = _PrepareShape(source, preparation, folder)
-    if workers == 1:
-        results = ((index, function(shape)) for index, shape in enumerate(left))
-    else:
+    function = partial(prepare_shape, source, preparation, folder)
+    results: Iterator[tuple[int, Any]] = enumerate(map(function, left))
+    if workers > 1:
         results = map_in_processes(function, left, workers)
-    quiet = None if progress else True  # None: no bar where nobody watches
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet)
-    return ((left[index], result) for index, result in bar)
+    # disable=None: no bar where nobody watches
+    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
+    return ((left[index], isinstance(result, Crashed)) for index, result in bar)
 
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
@@ -268,12 +252,6 @@ def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
 def _file(folder: Path, id: str) -> Path:
     check_id(id)
     return folder / f"{id}{SUFFIX}"
-
-
-def _ids_in(folder: Path) -> list[str]:
-    files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
-    paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
-    return sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
 
 
 def _read(
@@ -296,43 +274,38 @@ def _read(
 
 
 def _checked(
-    folder: Path, shapes: list[Shape], source: Source, level: int = logging.DEBUG
+    folder: Path,
+    shapes: list[Shape],
+    up: Literal["y", "z"],
+    about: dict[str, Any] | None = None,
+    level: int = logging.WARNING,
 ) -> dict[str, StoredShape]:
-    """The stored shapes whose files are intact, by id; damage is logged at `level`."""
-    stored = _read(folder, [shape.id for shape in shapes], source.up, level)
-    known = _index(folder).get("checked", {})
-    changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
+    """The stored shapes whose files are intact, by id; damage is logged at `level`.
+
+    The index notes which files are intact, and for a reader what the store was made of.
+    """
+    stored = _read(folder, [shape.id for shape in shapes], up, level)
+    try:
+        known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]
+        changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        known, changed = {}, dict(stored)
     with ThreadPoolExecutor() as pool:  # hashing lets other threads run
         intact = dict(zip(changed, pool.map(StoredShape.is_intact, changed.values()), strict=True))
     for id in [id for id, is_intact in intact.items() if not is_intact]:
         log.log(level, "store: %s: damaged (checksum): to be prepared again", stored.pop(id).path)
-    _remember(folder, {id: stored[id] for id in changed if id in stored})
-    return stored
-
-
-def _index(folder: Path) -> dict:
-    try:
-        index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
-        return index if isinstance(index["checked"], dict) else {}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return {}
-
-
-def _remember(folder: Path, intact: dict[str, StoredShape], about: dict | None = None) -> None:
-    """Notes that files are intact, and for a reader what the store was made of."""
-    if intact:
-        index = _index(folder)
-        states = {id: shape.state for id, shape in intact.items()}
-        checked = dict(sorted((index.get("checked", {}) | states).items()))
-        index = {"about": about or index.get("about"), "checked": checked}
+    states = {id: stored[id].state for id in changed if id in stored}
+    if states and about:
+        index = {"about": about, "checked": dict(sorted((known | states).items()))}
         with suppress(OSError):  # a store that others own is read all the same
             write_whole(folder / INDEX, json.dumps(index, indent=1))
+    return stored
 
 
 def _remove_leftovers(folder: Path) -> None:
     """Removes the half-written files of runs that were killed more than an hour ago."""
     for path, _, names in os.walk(folder):
-        for leftover in (Path(path, name) for name in names if _LEFTOVER.fullmatch(name)):
+        for leftover in (Path(path, name) for name in names if re.fullmatch(r"\..+\.[0-9a-f]{12}", name)):
             if time.time() - leftover.lstat().st_mtime > 3600:
                 leftover.unlink(missing_ok=True)
 

@@ -7,16 +7,18 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
-from typing import Annotated, BinaryIO, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import ConfigDict, PositiveFloat, TypeAdapter
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, InFrame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
@@ -28,6 +30,7 @@ indices. The one of 8 bytes a number comes first, so that all are aligned."""
 DTYPES = {"vertices": "<f8", "outside": "<f4", "inside": "<f4", "surface": "<f4", "faces": "<i4"}
 _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
+NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,7 @@ class Record:
     Args:
         fingerprint, category, credits: as the source gave them.
         seconds: what loading and preparing took.
-        center: source units; `source = normalised / scale + center`.
-        scale: normalised units per source unit.
+        center, scale: of its `Frame`.
         statistics: plain numbers about the preparation.
         reason: why the shape was rejected; None where it was not.
         detail: of the rejection.
@@ -52,7 +54,7 @@ class Record:
     credits: dict[str, str]
     seconds: float = 0.0
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: Annotated[float, Field(gt=0)] = 1.0
+    scale: PositiveFloat = 1.0
     statistics: dict[str, float] = field(default_factory=dict)
     reason: str | None = None
     detail: str = ""
@@ -64,25 +66,21 @@ _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
 
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
     """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
-    rng = np.random.default_rng(seed)
+    rng, inside = np.random.default_rng(seed), samples.sdf < 0
     rows = np.column_stack([samples.points, samples.sdf])
+    arrays = {"outside": rng.permutation(rows[~inside]), "inside": rng.permutation(rows[inside])}
     surface = np.column_stack([samples.surface_points, samples.surface_normals])
-    inside = samples.sdf < 0
-    arrays = {
-        "outside": rng.permutation(rows[~inside]),
-        "inside": rng.permutation(rows[inside]),
-        "surface": rng.permutation(surface),
-    }
+    arrays["surface"] = rng.permutation(surface)
     if samples.mesh is not None:
         arrays |= {"vertices": samples.mesh.vertices, "faces": samples.mesh.faces}
     return {name: np.ascontiguousarray(array, dtype=DTYPES[name]) for name, array in arrays.items()}
 
 
 def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) -> None:
-    """Writes one shape's file.
+    """Writes one shape's file in the place of what lies there.
 
     Args:
-        path: what lies there is replaced.
+        path: of the file.
         arrays: as `arrays_of` makes them; empty for a rejected shape.
         record: its `sha256` is filled in.
     """
@@ -117,7 +115,7 @@ def _digest(record: Record, header: Mapping[str, dict]) -> "hashlib._Hash":
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode())
 
 
-class StoredShape:
+class StoredShape(InFrame):
     """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
     Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
@@ -130,8 +128,7 @@ class StoredShape:
 
     Attributes:
         record: all that is known of the shape; `record.reason` is set where it was rejected.
-        center: [3] float64, source units; `source = normalised / scale + center`.
-        scale: normalised units per source unit.
+        frame: the way back to the source's frame.
         state: changes when the file is written anew.
 
     Raises:
@@ -143,29 +140,29 @@ class StoredShape:
         self.id, self.path, self.up = id, path, up
         with self._open() as file:
             status = os.fstat(file.fileno())
-            self.state = f"{status.st_size} {status.st_mtime_ns}"
             length = int.from_bytes(file.read(8), "little")
             if length > min(status.st_size, _MAX_HEADER):
                 raise ValueError("its header is damaged")
             text = file.read(length)
         try:
-            found = json.loads(text)
-            self.record = _RECORD.validate_json(found.pop("__metadata__")["record"])
-            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in found.items()}
-            header = _header(self._rows)
-            is_ours = found == header and all(type(rows) is int and rows >= 0 for rows in self._rows.values())
+            header = json.loads(text)
+            self.record = _RECORD.validate_json(header.pop("__metadata__")["record"])
+            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in header.items()}
+            is_ours = header == _header(self._rows)
+            is_ours &= all(type(rows) is int and rows >= 0 for rows in self._rows.values())
         except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
             raise ValueError(f"its header is damaged: {error!r}") from error
         if not is_ours:
             raise ValueError("its header is damaged")
-        self._start, self._size = 8 + length, status.st_size
+        self.state, self._size = f"{status.st_size} {status.st_mtime_ns}", status.st_size
+        self._start = 8 + length
         self._offsets = {name: self._start + entry["data_offsets"][0] for name, entry in header.items()}
         size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
         if size != self._size:
             raise ValueError(f"it has {self._size} bytes, not {size}")
-        self.category, self.fingerprint = self.record.category, self.record.fingerprint
-        self.credits, self.scale = self.record.credits, self.record.scale
-        self.center = np.array(self.record.center, dtype=np.float64)
+        self.category, self.credits = self.record.category, self.record.credits
+        self.fingerprint = self.record.fingerprint
+        self.frame = Frame(np.array(self.record.center, dtype=np.float64), self.record.scale)
 
     @property
     def outside(self) -> np.ndarray:
@@ -188,7 +185,7 @@ class StoredShape:
         if "faces" not in self._rows:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
-        return NormalizedMesh(vertices, faces, Frame(self.center, self.scale))
+        return NormalizedMesh(vertices, faces, self.frame)
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
@@ -205,16 +202,12 @@ class StoredShape:
         if not len(rows):
             return
         start %= self.rows(name)
-        try:
-            with self._open() as file:
-                self._refuse_other_size(file)
-                while len(rows):
-                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
-                    file.seek(self._offsets[name] + start * part.strides[0])
-                    file.readinto(part.data.cast("B"))
-                    start = 0
-        except (OSError, ValueError) as error:
-            raise self._broken(error) from error
+        with self._unchanged() as file:
+            while len(rows):
+                part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                file.seek(self._offsets[name] + start * part.strides[0])
+                file.readinto(part.data.cast("B"))
+                start = 0
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
@@ -226,28 +219,25 @@ class StoredShape:
         except OSError:
             return False
 
-    def _open(self) -> BinaryIO:
-        return open(self.path, "rb", opener=_without_links)
+    def _open(self) -> BufferedReader:
+        return open(self.path, "rb", opener=lambda path, flags: os.open(path, flags | NO_LINKS))
 
     def _map(self, name: str) -> np.ndarray:
         shape = (self.rows(name), COLUMNS[name])
         if not shape[0]:  # an empty file cannot be mapped
             return np.zeros(shape, dtype=DTYPES[name])
+        with self._unchanged() as file:
+            return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
+
+    @contextmanager
+    def _unchanged(self) -> Iterator[BufferedReader]:
+        """The open file, of the size that it had."""
         try:
             with self._open() as file:
-                self._refuse_other_size(file)
-                return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
+                if (size := os.fstat(file.fileno()).st_size) != self._size:
+                    raise ValueError(f"it has {size} bytes, not {self._size}")
+                yield file
         except (OSError, ValueError) as error:
-            raise self._broken(error) from error
-
-    def _refuse_other_size(self, file: BinaryIO) -> None:
-        if (size := os.fstat(file.fileno()).st_size) != self._size:
-            raise ValueError(f"it has {size} bytes, not {self._size}")
-
-    def _broken(self, error: Exception) -> SdfhubError:
-        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-        return SdfhubError(f"{self.path}: {why}; start or prepare again: damaged shapes are prepared anew")
-
-
-def _without_links(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))
+            why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
+            what = f"{why}; start or prepare again: damaged shapes are prepared anew"
+            raise SdfhubError(f"{self.path}: {what}") from error
