@@ -50,7 +50,7 @@ SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs
 
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
-    """Exact unsigned distances to all faces, sheets too, of points [N, 3] float64; fastest in `morton_order`."""
+    """Exact unsigned distances to all faces of points [N, 3] float64; fastest in `morton_order`."""
     vertices, faces, source = cut_long(surface.vertices, surface.faces, NEAREST_EDGE)
     tree = igl.AABB()
     tree.init(vertices, faces)

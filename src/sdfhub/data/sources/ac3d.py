@@ -79,31 +79,27 @@ class _Reader:
 def _read_object(
     reader: _Reader, parts: list[Mesh], rotation: np.ndarray, origin: np.ndarray, depth: int
 ) -> None:
-    """Reads one object and its kids, up to and with the last kid.
-
-    Args:
-        rotation: [3, 3] of the parent; rows of points are multiplied from the left.
-        origin: [3], the parent's origin in the world.
-    """
+    """Reads one object and its kids, given the parent's rotation [3, 3], from the left, and origin [3]."""
     if depth > MAX_DEPTH:
         raise ValueError(f"objects are nested more than {MAX_DEPTH} deep")
-    own_rotation, location, vertices, surfaces = np.eye(3), np.zeros(3), np.zeros((0, 3)), []
-    while True:
+    own_rotation, location, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
+    surfaces: list[tuple[int, int, int]] = []
+    kids = None
+    while kids is None:
         words = reader.line()
-        match words[:1]:
-            case ["rot"]:
+        match words[0]:
+            case "rot":
                 own_rotation = np.array(words[1:10], dtype=np.float64).reshape(3, 3)
-            case ["loc"]:
+            case "loc":
                 location = np.array(words[1:4], dtype=np.float64).reshape(3)
-            case ["data"]:
+            case "data":
                 reader.skip(int(words[1]))
-            case ["numvert"]:
+            case "numvert":
                 vertices = reader.rows(int(words[1]), 3)
-            case ["numsurf"]:
+            case "numsurf":
                 surfaces = [face for _ in range(int(words[1])) for face in _read_surface(reader)]
-            case ["kids"]:
+            case "kids":
                 kids = int(words[1])
-                break
     origin = location @ rotation + origin
     rotation = own_rotation @ rotation
     faces = np.array(surfaces, dtype=np.int64).reshape(-1, 3)
@@ -111,9 +107,10 @@ def _read_object(
         raise ValueError("a surface has a vertex that is not there")
     parts.append(Mesh(vertices @ rotation + origin, faces))
     for _ in range(kids):
-        while (words := reader.next_line()) is not None and words[:1] != ["OBJECT"]:
-            pass
-        if words is None:
+        line = reader.next_line()
+        while line and line[0] != "OBJECT":
+            line = reader.next_line()
+        if not line:
             return  # many files announce more kids than they hold
         _read_object(reader, parts, rotation, origin, depth + 1)
 

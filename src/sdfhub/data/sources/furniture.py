@@ -3,8 +3,7 @@
 import re
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from urllib.parse import unquote
 
 from sdfhub.errors import RejectedMesh, SdfhubError
@@ -15,25 +14,8 @@ MAX_MODEL = 256 << 20
 """Bytes of one unpacked model: a small archive may claim any size."""
 
 
-@dataclass(frozen=True)
-class Furniture:
-    """One entry of a catalogue whose model is an OBJ file.
-
-    Args:
-        archive: the .sh3f file.
-        member: the model's name within it.
-        title: as the catalogue names it.
-        credits: author, licence and title.
-    """
-
-    archive: Path
-    member: str
-    title: str
-    credits: dict[str, str]
-
-
-def furniture_in(archive: Path) -> Iterator[Furniture]:
-    """The entries of a library in the catalogue's order.
+def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Of a library's OBJ models, in the catalogue's order: name in the archive; author, licence and title.
 
     Raises:
         SdfhubError: not a zip archive with a catalogue.
@@ -44,14 +26,13 @@ def furniture_in(archive: Path) -> Iterator[Furniture]:
             members = set(library.namelist())
     except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
         raise SdfhubError(f"{archive}: not a furniture library ({error}); fetch it again") from error
-    numbers = sorted(int(key[5:]) for key in entries if re.fullmatch(r"name#\d{1,9}", key))
-    for number in numbers:
+    for number in sorted(int(key[5:]) for key in entries if re.fullmatch(r"name#\d{1,9}", key)):
         entry = {key: entries.get(f"{key}#{number}", "") for key in ("name", "model", "creator", "license")}
-        member = next((m for m in _member_names(entry["model"]) if m in members), None)
-        if member and member.lower().endswith(".obj"):
+        names = (name.lstrip("/") for name in (entry["model"], unquote(entry["model"])))
+        member = next((name for name in names if name in members and ".." not in name.split("/")), "")
+        if member.lower().endswith(".obj"):
             licence = entry["license"] or entries.get("license", "")
-            credits = {"author": entry["creator"], "licence": licence, "title": entry["name"]}
-            yield Furniture(archive, member, entry["name"], credits)
+            yield member, {"author": entry["creator"], "licence": licence, "title": entry["name"]}
 
 
 def read_model(archive: Path, member: str) -> bytes:
@@ -79,14 +60,6 @@ def parse_properties(text: str) -> dict[str, str]:
 def _unescaped(value: str) -> str:
     letters = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), value)
     return re.sub(r"\\(.)", r"\1", letters).strip()
-
-
-def _member_names(model: str) -> Iterator[str]:
-    """The names under which an archive may hold a model; none that leads out of it."""
-    for name in (model, unquote(model)):
-        path = PurePosixPath(name.lstrip("/"))
-        if name and ".." not in path.parts:
-            yield str(path)
 
 
 def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:
