@@ -35,28 +35,18 @@ def _check(name: str, array: Any, shape: tuple[int | None, ...], dtype: Any) -> 
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh in any frame.
+    """A triangle mesh in any frame."""
 
-    Args:
-        vertices: [V, 3] float64.
-        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside; F = 0 where it is empty.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # [V, 3] float64
+    faces: np.ndarray  # [F, 3] int64 rows of vertices, counter-clockwise seen from outside; F = 0: empty
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where a shape's normalised frame lies in its source's frame.
+    """Where a shape's normalised frame lies in its source's frame."""
 
-    Args:
-        center: [3] float64, source units.
-        scale: normalised units per source unit, > 0.
-    """
-
-    center: np.ndarray
-    scale: float
+    center: np.ndarray  # [3] float64, source units
+    scale: float  # normalised units per source unit, > 0
 
     def __post_init__(self) -> None:
         _check("center", self.center, (3,), np.float64)
@@ -106,16 +96,10 @@ class InFrame:
 
 @dataclass(frozen=True)
 class NormalizedMesh(InFrame):
-    """A triangle mesh in the normalised frame.
+    """A triangle mesh in the normalised frame."""
 
-    Args:
-        vertices: [V, 3] float64, all within the unit ball.
-        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside.
-        frame: the way back to the source's frame.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # [V, 3] float64, all within the unit ball
+    faces: np.ndarray  # [F, 3] int64 rows of vertices, counter-clockwise seen from outside
     frame: Frame = NORMALIZED
 
     def __post_init__(self) -> None:
@@ -129,25 +113,15 @@ class NormalizedMesh(InFrame):
 
 @dataclass(frozen=True)
 class ShapeSamples(InFrame):
-    """Signed distances and oriented surface points of one shape, normalised frame.
+    """Signed distances and oriented surface points of one shape, normalised frame."""
 
-    Args:
-        points: [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little.
-        sdf: [N] float32, negative inside.
-        surface_points: [M, 3] float32; M = 0 where the source has none.
-        surface_normals: [M, 3] float32, unit length, outward.
-        frame: the way back to the source's frame.
-        mesh: the oriented faces from which the samples were taken, or None (DeepSDF's npz have none).
-        statistics: numbers about the preparation (two-sided area, inside fraction, ...).
-    """
-
-    points: np.ndarray
-    sdf: np.ndarray
-    surface_points: np.ndarray
-    surface_normals: np.ndarray
+    points: np.ndarray  # [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little
+    sdf: np.ndarray  # [N] float32, negative inside
+    surface_points: np.ndarray  # [M, 3] float32; M = 0 where the source has none
+    surface_normals: np.ndarray  # [M, 3] float32, unit length, outward
     frame: Frame
-    mesh: NormalizedMesh | None
-    statistics: dict[str, float]
+    mesh: NormalizedMesh | None  # the oriented faces that were sampled; DeepSDF's npz have none
+    statistics: dict[str, float]  # of the preparation (two-sided area, inside fraction, ...)
 
     def __post_init__(self) -> None:
         n, m = len(self.points), len(self.surface_points)
@@ -162,26 +136,18 @@ class ShapeSamples(InFrame):
 
 @dataclass(frozen=True)
 class Observation:
-    """Bounds on the signed distances of one shape at some points.
+    """Bounds on the signed distances of one shape at some points, in random order.
 
     A sample of the field has equal bounds; a point on the surface has 0 and 0; a point that a ray crossed
     has 0 or more below; any point has its distance to the observed surface above.
-
-    Args:
-        points: [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity); in random order.
-        low: [N] float32, least signed distance there.
-        high: [N] float32, largest; high >= low.
-        unsigned: [N] bool, whether low and high bound the absolute value, since no side is known.
-        noise: standard deviation of the surface points, same frame, >= 0.
-        partial: whether a part of the shape's surface was not seen.
     """
 
-    points: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    unsigned: np.ndarray
-    noise: float = 0.0
-    partial: bool = False
+    points: np.ndarray  # [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity)
+    low: np.ndarray  # [N] float32, least signed distance
+    high: np.ndarray  # [N] float32, largest
+    unsigned: np.ndarray  # [N] bool, whether low and high bound the absolute value, since no side is known
+    noise: float = 0.0  # standard deviation of the surface points, same frame, >= 0
+    partial: bool = False  # whether a part of the shape's surface was not seen
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -208,21 +174,13 @@ class Observation:
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of B shapes for one training step, normalised frame; the shape axis is kept.
+    """Samples of B shapes for one training step, normalised frame; the shape axis is kept."""
 
-    Args:
-        rows: [B] int64, row of each shape in the code table.
-        points: [B, N, 3] float32.
-        sdf: [B, N] float32, negative inside.
-        surface_points: [B, M, 3] float32; M = 0 without normals.
-        surface_normals: [B, M, 3] float32, unit length, outward.
-    """
-
-    rows: "torch.Tensor"
-    points: "torch.Tensor"
-    sdf: "torch.Tensor"
-    surface_points: "torch.Tensor"
-    surface_normals: "torch.Tensor"
+    rows: "torch.Tensor"  # [B] int64, row of each shape in the code table
+    points: "torch.Tensor"  # [B, N, 3] float32
+    sdf: "torch.Tensor"  # [B, N] float32, negative inside
+    surface_points: "torch.Tensor"  # [B, M, 3] float32; M = 0 without normals
+    surface_normals: "torch.Tensor"  # [B, M, 3] float32, unit length, outward
 
     def __post_init__(self) -> None:
         import torch  # here: meshes and samples do without it

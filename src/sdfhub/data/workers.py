@@ -58,9 +58,9 @@ def stream_in_processes(function: Callable, items: Iterable, workers: int) -> It
 
     Args:
         function, items: as for `map_in_processes`; items are taken one by one.
-        workers: processes; 0 for none but this one.
+        workers: processes; below 2 for none but this one.
     """
-    if workers < 1:
+    if workers < 2:
         yield from map(function, items)
         return
     waiting: deque[tuple[Any, Future | None]] = deque()
@@ -74,12 +74,6 @@ def stream_in_processes(function: Callable, items: Iterable, workers: int) -> It
                 yield _result(function, *waiting.popleft())
         while waiting:
             yield _result(function, *waiting.popleft())
-
-
-def workers_worth(items: int, each: int) -> int:
-    """Worker processes for so many items where one pays for `each`; 0, for none, where it would be one."""
-    workers = min(os.cpu_count() or 1, items // each)
-    return workers if workers > 1 else 0
 
 
 def _in_pool(function: Callable, items: dict[int, Any], workers: int) -> Iterator[tuple[int, Any]]:

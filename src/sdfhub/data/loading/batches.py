@@ -24,16 +24,11 @@ class Augmentation:
 
     The paper names data augmentation and does not describe it. Reflection and uniform scaling are the
     transforms under which a signed distance stays exact (d becomes scale * d).
-
-    Args:
-        copies: transformed copies of each shape, >= 0; 0 switches augmentation off.
-        mirror: whether odd copies are reflected in the plane x = 0.
-        smallest: lower end of the uniform distribution, up to 1, of a copy's scale, in (0, 1].
     """
 
-    copies: NonNegativeInt = 0
-    mirror: bool = True
-    smallest: Annotated[float, Field(gt=0, le=1)] = 0.8
+    copies: NonNegativeInt = 0  # of each shape
+    mirror: bool = True  # odd copies in the plane x = 0
+    smallest: Annotated[float, Field(gt=0, le=1)] = 0.8  # scales are uniform from here to 1
 
     def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
         """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
@@ -46,28 +41,16 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class Loading:
-    """How much of which shapes a training step sees.
+    """How much of which shapes a training step sees."""
 
-    Args:
-        shapes_per_step: B, >= 1.
-        samples_per_shape: N, half outside, half inside, >= 2.
-        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
-        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
-            from being shorter than their overhead.
-        workers: loader processes; 0 draws in the training process.
-        augmentation: extra shapes.
-        seed: of every draw.
-        resident: whether all samples lie in the memory of the device that trains; None: where that is a GPU.
-    """
-
-    shapes_per_step: PositiveInt = 20
-    samples_per_shape: Annotated[int, Field(ge=2)] = 512
-    surface_per_shape: NonNegativeInt = 0
-    passes_per_epoch: PositiveInt = 1
-    workers: NonNegativeInt = 0
+    shapes_per_step: PositiveInt = 20  # B
+    samples_per_shape: Annotated[int, Field(ge=2)] = 512  # N, half outside, half inside
+    surface_per_shape: NonNegativeInt = 0  # M oriented surface points a step and shape; 0 without normals
+    passes_per_epoch: PositiveInt = 1  # visits to every shape: few shapes make epochs too short otherwise
+    workers: NonNegativeInt = 0  # loader processes; 0 draws in the training process
     augmentation: Augmentation = Augmentation()
-    seed: NonNegativeInt = 0
-    resident: bool | None = None
+    seed: NonNegativeInt = 0  # of every draw
+    resident: bool | None = None  # all samples in the memory of the device; None: where that is a GPU
 
 
 class StepBatches(Dataset):
@@ -99,11 +82,18 @@ class StepBatches(Dataset):
         return self.steps_per_pass * self.loading.passes_per_epoch
 
     def __getitem__(self, step: int) -> Batch:
-        rows = self.rows_of(step)
-        samples = np.empty((len(rows), self.loading.samples_per_shape, 4), np.float32)
-        surface = np.empty((len(rows), self.loading.surface_per_shape, 6), np.float32)
-        for row, *of_shape in zip(rows, samples, surface, strict=True):
-            self._draw(int(row), self.generator(step, row), *of_shape)
+        rows, loading = self.rows_of(step), self.loading
+        samples = np.empty((len(rows), loading.samples_per_shape, 4), np.float32)
+        surface = np.empty((len(rows), loading.surface_per_shape, 6), np.float32)
+        for row, points, oriented in zip(rows, samples, surface, strict=True):
+            copy, index = divmod(int(row), len(self.shapes))
+            rng = self.generator(step, row)
+            draw_signed(points, self.shapes[index], rng)
+            draw_rows(oriented, self.shapes[index], "surface", rng)
+            if copy:
+                axes, scale = loading.augmentation.transform(copy, int(row), loading.seed)
+                points *= np.append(axes, scale)
+                oriented *= np.concatenate([axes, np.sign(axes)])
         return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
 
     def rows_of(self, step: int) -> np.ndarray:
@@ -117,17 +107,6 @@ class StepBatches(Dataset):
     def generator(self, step: int, row: int) -> np.random.Generator:
         """What draws the samples of one row at one step."""
         return np.random.default_rng((self.loading.seed, 2, step, row))
-
-    def _draw(self, row: int, rng: np.random.Generator, samples: np.ndarray, surface: np.ndarray) -> None:
-        """Fills samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
-        copy, index = divmod(row, len(self.shapes))
-        shape = self.shapes[index]
-        draw_signed(samples, shape, rng)
-        draw_rows(surface, shape, "surface", rng)
-        if copy:
-            axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
-            samples *= np.append(axes, scale)
-            surface *= np.concatenate([axes, np.sign(axes)])
 
 
 def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:

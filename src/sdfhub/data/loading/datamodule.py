@@ -60,34 +60,22 @@ class SdfDataModule(L.LightningDataModule):
     Batches derive from (seed, step): a resumed training sees what an undisturbed one would. In a
     distributed training give the trainer `use_distributed_sampler=False`; each batch is shared here.
 
-    Args:
-        source: where shapes come from.
-        store: folder of prepared samples, shared by all runs.
-        workers: processes that prepare shapes; None: one per core.
-        shapes: how many to train on; None takes all that are not held out. For a source such as a
-            folder, which has what it has, an upper bound.
-        held_out: how many are never trained on; see `splits.split`.
-        split_seed: draws both.
-        preparation: how meshes become samples.
-        loader: what a training step sees.
-        validation_shapes: shapes of each role that `val_dataloader` yields.
-
     Attributes:
-        train_shapes: prepared shapes in the order of the code table, after `setup`.
-        held_out_shapes: prepared shapes, after `setup`.
+        train_shapes, held_out_shapes: prepared, in the order of the code table, after `setup`.
     """
 
     def __init__(
         self,
         source: Source,
-        store: str = "data/store",
-        workers: PositiveInt | None = None,
-        shapes: PositiveInt | None = None,
-        held_out: NonNegativeInt = 4,
-        split_seed: NonNegativeInt = 0,
+        store: str = "data/store",  # folder of prepared samples, shared by all runs
+        workers: PositiveInt | None = None,  # processes that prepare shapes; None: one per core
+        shapes: PositiveInt
+        | None = None,  # to train on; None: all not held out; for a folder at most so many
+        held_out: NonNegativeInt = 4,  # never trained on; see `splits.split`
+        split_seed: NonNegativeInt = 0,  # draws both
         preparation: Preparation = DEFAULT,
         loader: Loading = Loading(),  # noqa: B008 - frozen
-        validation_shapes: NonNegativeInt = 2,
+        validation_shapes: NonNegativeInt = 2,  # of each role, in `val_dataloader`
     ):
         super().__init__()
         self.source, self.store, self.workers = source, store, workers

@@ -60,15 +60,9 @@ def prepare_mesh(
     if not low <= inside <= high:
         raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
     surface_points, surface_normals = _oriented_points(surface, preparation.surface_points, rng)
-    return ShapeSamples(
-        points=points.astype(np.float32),
-        sdf=sdf.astype(np.float32),
-        surface_points=surface_points.astype(np.float32),
-        surface_normals=surface_normals.astype(np.float32),
-        frame=normalized.frame,
-        mesh=NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
-        statistics=statistics,
-    )
+    kept = NormalizedMesh(surface.vertices, surface.faces, normalized.frame)
+    arrays = (array.astype(np.float32) for array in (points, sdf, surface_points, surface_normals))
+    return ShapeSamples(*arrays, normalized.frame, kept, statistics)
 
 
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:

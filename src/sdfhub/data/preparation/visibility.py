@@ -44,19 +44,12 @@ TOUCH = 5e-6
 
 @dataclass(frozen=True)
 class Surface:
-    """The faces that bound a shape, oriented outwards.
+    """The faces that bound a shape, oriented outwards, normalised frame."""
 
-    Args:
-        vertices: [V, 3] float64, normalised frame.
-        faces: [F, 3] int64, counter-clockwise seen from outside.
-        two_sided: [F] bool, sheets seen from both sides: a distance, but no inside.
-        statistics: plain numbers about how the faces were found.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    two_sided: np.ndarray
-    statistics: dict[str, float]
+    vertices: np.ndarray  # [V, 3] float64
+    faces: np.ndarray  # [F, 3] int64, counter-clockwise seen from outside
+    two_sided: np.ndarray  # [F] bool, sheets seen from both sides: a distance, but no inside
+    statistics: dict[str, float]  # about how the faces were found
 
     def solid(self) -> np.ndarray:
         """[S, 3] the faces that separate inside from outside."""
@@ -64,21 +57,17 @@ class Surface:
 
 
 class Sightings(NamedTuple):
-    """How much of the faces is seen, as a share of what isolated ones would be from all around.
+    """How much of the faces is seen, as a share of what isolated ones would be from all around."""
 
-    Front is the counter-clockwise side. An unoccluded side reaches about 0.5.
-    """
-
-    front: np.ndarray
-    back: np.ndarray
+    front: np.ndarray  # [F] of the counter-clockwise side; an unoccluded one reaches about 0.5
+    back: np.ndarray  # [F]
 
 
 def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
     """The share of each face's two sides that parallel views from all around see.
 
-    Rays are aimed at points on the faces rather than spread over pictures: a small face is then judged by as
-    many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
-    large ones more often; a second looks again at those with too few sightings, or some from either side.
+    Rays are aimed at points on the faces: a small one is then judged by as many as it needs. A first round
+    looks at every face, large ones more often; a second at those seen too little, or from either side.
     """
     observer = _Observer(mesh, rng.permutation(sphere_directions(views)), rng)
     large = (observer.area / observer.area.sum() * LARGE).astype(np.int64)

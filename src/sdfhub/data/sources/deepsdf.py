@@ -68,16 +68,15 @@ class DeepSdfSource(SourceOfFiles):
 
 def by_synset(categories: Mapping[str, Any] | None) -> dict[str, str]:
     """Category of each synset that the settings of categories name."""
-    return {
-        settings["synset"]: name for name, settings in (categories or {}).items() if settings.get("synset")
-    }
+    items = (categories or {}).items()
+    return {settings["synset"]: name for name, settings in items if settings.get("synset")}
 
 
 def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
-    """The id of the shape whose samples lie at a path such as `ShapeNetV2/03001627/1a2b`, without suffix.
+    """The id of the shape whose samples lie at a path such as `ShapeNetV2/03001627/1a2b` below a root.
 
     Args:
-        path: below the root.
+        path: without suffix.
         category_of: category of each synset.
         above: name of the root.
     """
@@ -94,7 +93,15 @@ def read_samples(path: Path) -> ShapeSamples:
         RejectedMesh: corrupt_file; one_sided_samples where nothing lies outside or nothing inside;
             wrong_frame where points lie beyond REACH.
     """
-    outside, inside = _rows(path, "pos"), _rows(path, "neg")
+    parts = []
+    for name in ("pos", "neg"):
+        rows = npz_array(path, name)
+        if rows.ndim != 2 or rows.shape[1] != 4:
+            what = f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]"
+            raise RejectedMesh("corrupt_file", what)
+        rows = rows.astype(np.float32)
+        parts.append(rows[np.isfinite(rows).all(axis=1)])
+    outside, inside = parts
     if not len(outside) or not len(inside):
         what = f"{path}: {len(outside)} samples outside, {len(inside)} inside"
         raise RejectedMesh("one_sided_samples", what)
@@ -107,22 +114,10 @@ def read_samples(path: Path) -> ShapeSamples:
     return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, statistics)
 
 
-def _rows(path: Path, name: str) -> np.ndarray:
-    rows = npz_array(path, name)
-    if rows.ndim != 2 or rows.shape[1] != 4:
-        raise RejectedMesh("corrupt_file", f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]")
-    rows = rows.astype(np.float32)
-    return rows[np.isfinite(rows).all(axis=1)]
-
-
 def frame_of(path: Path) -> Frame | None:
-    """The frame of samples, by DeepSDF's `normalised = (source + offset) * scale`; None: unknown.
+    """The frame of samples at `.../SdfSamples/...npz`, there or not; None: unknown.
 
-    Args:
-        path: of the samples, `.../SdfSamples/...npz`, whether or not they are there.
-
-    Raises:
-        RejectedMesh: corrupt_file.
+    Source: DeepSDF's code, `normalised = (source + offset) * scale`.
     """
     if not (beside := _frame_file(path)):
         return None

@@ -22,10 +22,7 @@ _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """The mesh in a file, in the file's frame and units.
-
-    The parts of a scene are put together under their transforms; polygons become triangles. Vertices are
-    neither merged nor dropped.
+    """The mesh in a file, in the file's frame and units: parts of a scene in place, polygons as triangles.
 
     Raises:
         SdfhubError: the file is missing, too large or of no known format.
@@ -42,11 +39,10 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = None) -> Mesh:
-    """The triangles of a mesh file's content; see `read_mesh`.
+    """The triangles of a whole mesh file's content; see `read_mesh`.
 
     Args:
-        content: the whole file.
-        suffix: one of FORMATS.
+        content, suffix: of the file; one of FORMATS.
         name: of the file in messages.
         folder: where a .gltf finds its buffers; None forbids other files.
     """

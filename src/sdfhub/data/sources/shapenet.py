@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any
 
-from pydantic import StringConstraints
+from pydantic import BaseModel, StringConstraints
 
 from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.sources.source import Shape, checked_categories, folder_safe
@@ -16,7 +16,7 @@ LAYOUTS = ("models/model_normalized.obj", "model.obj")
 """Where a model's mesh lies in its folder: version 2, version 1."""
 
 
-class Category(TypedDict):
+class Category(BaseModel):
     """A category's settings: ShapeNet's number of it, a quoted string of digits."""
 
     synset: Annotated[str, StringConstraints(pattern=r"^\d+$")]
@@ -43,7 +43,7 @@ class ShapeNetSource(SourceOfFiles):
     ):
         super().__init__("shapenet", root, train_split, test_split)
         checked = checked_categories(categories, Category)
-        self.synsets = {name: category["synset"] for name, category in sorted(checked.items())}
+        self.synsets = {name: category.synset for name, category in sorted(checked.items())}
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         for category, synset in self.synsets.items():

@@ -21,40 +21,25 @@ Settings = TypeVar("Settings")
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape of a source, before anything of it is loaded.
+    """One shape of a source, before anything of it is loaded."""
 
-    Args:
-        id: unique within the source and safe as a folder's path, such as `chairs/0007`.
-        category: such as `chairs`; splits draw evenly over categories.
-        fingerprint: changes when the shape changes (hash of the file, or generator version and index).
-        split: the role that a split file gives, or None.
-        credits: author, licence, title, as far as known.
-    """
-
-    id: str
-    category: str
-    fingerprint: str
-    split: Role | None = None
-    credits: dict[str, str] = field(default_factory=dict)
+    id: str  # unique within the source and safe as a folder's path, such as `chairs/0007`
+    category: str  # such as `chairs`; splits draw evenly over categories
+    fingerprint: str  # changes when the shape changes (hash of the file, or generator version and index)
+    split: Role | None = None  # as a split file says
+    credits: dict[str, str] = field(default_factory=dict)  # author, licence, title, as far as known
 
     def __post_init__(self) -> None:
         check_id(self.id)
 
 
 class Source(ABC):
-    """Where shapes come from. Sources pickle: worker processes load through them.
+    """Where shapes come from. Sources pickle: worker processes load through them."""
 
-    Attributes:
-        name: folder-safe; the store keeps one folder per name, so it tells two roots apart.
-        up: the axis that points up in the source's frame; only pictures are turned by it.
-        has_normals: whether its shapes come with surface normals.
-        is_collection: whether it has what it has, so that numbers of shapes asked for are upper bounds.
-    """
-
-    name: str
-    up: Literal["y", "z"] = "y"
-    has_normals = True
-    is_collection = False
+    name: str  # folder-safe; the store keeps one folder per name, so it tells two roots apart
+    up: Literal["y", "z"] = "y"  # in the source's frame; only pictures are turned by it
+    has_normals = True  # whether its shapes come with surface normals
+    is_collection = False  # whether it has what it has: numbers of shapes asked for are upper bounds
 
     @property
     def label(self) -> str:
@@ -85,7 +70,7 @@ def checked_categories(categories: Any, settings: type[Settings]) -> dict[str, S
     except ValidationError as error:
         problem = error.errors()[0]
         key = ".".join(map(str, ("category", *problem["loc"])))
-        raise SdfhubError(f"{key}={problem['input']!r}: {problem['msg']}") from error
+        raise SdfhubError(f"{key}={problem['input']}: {problem['msg']}") from error
 
 
 def folder_safe(text: str) -> str:

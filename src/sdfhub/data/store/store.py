@@ -46,8 +46,8 @@ TRIED_AGAIN = ("error", "crash")
 """Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
 
 
-class Store:
-    """Prepared shapes of one source under one preparation.
+class Store(dict[str, StoredShape]):
+    """Prepared shapes of one source under one preparation by id, in the order asked for.
 
     Args:
         folder: of the store.
@@ -56,57 +56,30 @@ class Store:
 
     def __init__(self, folder: Path, shapes: Iterable[StoredShape]):
         shapes = list(shapes)
+        super().__init__({shape.id: shape for shape in shapes if not shape.record.reason})
         self.folder = folder
         self.rejected: dict[str, Record] = {shape.id: shape.record for shape in shapes if shape.record.reason}
-        self._shapes = {shape.id: shape for shape in shapes if not shape.record.reason}
 
     @classmethod
-    def open(cls, root: str | Path, ids: Iterable[str] | None = None) -> "Store":
-        """The store whose files lie in `root`, limited to `ids`; None takes all it has.
-
-        Raises:
-            SdfhubError: no prepared shapes there, or a shape that was never prepared.
-        """
-        folder = Path(root)
+    def open(cls, folder: Path, up: Literal["y", "z"] = "z") -> "Store":
+        """All shapes whose files lie in `folder`; raises SdfhubError where there are none."""
         files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
         paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
-        there = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
-        if not there:
-            raise SdfhubError(f"{root}: holds no prepared shapes; run `sdfhub prepare` first")
-        ids = there if ids is None else list(ids)
-        shapes = _read(folder, [id for id in ids if id in set(there)])
-        if missing := [id for id in ids if id not in shapes]:
-            raise SdfhubError(f"{folder}: shape {missing[0]} has not been prepared; run `sdfhub prepare`")
-        return cls(folder, shapes.values())
+        ids = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
+        if not ids:
+            raise SdfhubError(f"{folder}: holds no prepared shapes; run `sdfhub prepare` first")
+        return cls(folder, _read(folder, ids, up).values())
 
-    @property
-    def ids(self) -> list[str]:
-        """The kept shapes, in the order asked for."""
-        return list(self._shapes)
-
-    def __len__(self) -> int:
-        return len(self._shapes)
-
-    def __contains__(self, id: str) -> bool:
-        return id in self._shapes
-
-    def __iter__(self) -> Iterator[StoredShape]:
-        return iter(self._shapes.values())
-
-    def __getitem__(self, id: str) -> StoredShape:
-        if id in self.rejected:
-            raise SdfhubError(f"shape {id} was rejected: {self.rejected[id].reason}")
-        if id not in self._shapes:
-            raise SdfhubError(f"shape {id} is not among the {len(self)} shapes opened from {self.folder}")
-        return self._shapes[id]
+    def __missing__(self, id: str) -> StoredShape:
+        why = f"was rejected: {self.rejected[id].reason}" if id in self.rejected else "is not there"
+        raise SdfhubError(f"{self.folder}: shape {id} {why}")
 
     def summary(self) -> str:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
-        reasons = Counter(record.reason for record in self.rejected.values())
-        seconds = sum(shape.record.seconds for shape in self) / max(1, len(self))
+        seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
-        for reason, count in reasons.most_common():
+        for reason, count in Counter(record.reason for record in self.rejected.values()).most_common():
             id, detail = next((id, r.detail) for id, r in self.rejected.items() if r.reason == reason)
             lines.append(f"  rejected {count} x {reason}, such as {id} ({detail})")
         return "\n".join(lines)
@@ -166,11 +139,7 @@ def prepare_part(
     """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
 
     Returns:
-        How many were prepared or rejected; the others were there, or are left to the next call, since
-        their worker died.
-
-    Raises:
-        SdfhubError: the store cannot be written.
+        How many were prepared or rejected; those whose worker died are left to the next call.
     """
     folder = Path(root) / source.name / preparation_hash(preparation)
     with _writing(folder):
@@ -192,11 +161,7 @@ def shape_seed(shape: Shape | StoredShape) -> int:
 
 
 def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape: Shape) -> None:
-    """Loads, samples and writes one shape, or the reason why it is rejected. Never raises for a bad mesh.
-
-    Raises:
-        OSError: the store cannot be written, which no other shape would survive either.
-    """
+    """Loads, samples and writes one shape, or why it is rejected; only the store can make it fail."""
     start, seed = time.perf_counter(), shape_seed(shape)
     arrays: dict[str, np.ndarray] = {}
     try:
@@ -241,12 +206,8 @@ def _prepared(
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     """The shapes that are not in the store as they are now."""
-
-    def is_done(shape: Shape) -> bool:
-        kept = stored.get(shape.id)
-        return bool(kept and kept.fingerprint == shape.fingerprint and kept.record.reason not in TRIED_AGAIN)
-
-    return [shape for shape in shapes if not is_done(shape)]
+    fine = {id for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
+    return [s for s in shapes if s.id not in fine or stored[s.id].fingerprint != s.fingerprint]
 
 
 def _file(folder: Path, id: str) -> Path:

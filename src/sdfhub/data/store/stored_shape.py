@@ -35,30 +35,20 @@ NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 @dataclass(frozen=True)
 class Record:
-    """What is known of a prepared or rejected shape.
-
-    Args:
-        fingerprint, category, credits: as the source gave them.
-        seconds: what loading and preparing took.
-        center, scale: of its `Frame`.
-        statistics: plain numbers about the preparation.
-        reason: why the shape was rejected; None where it was not.
-        detail: of the rejection.
-        sha256: of all else in the file.
-    """
+    """What is known of a prepared or rejected shape."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
-    fingerprint: str
+    fingerprint: str  # this and the next two as the source gave them
     category: str
     credits: dict[str, str]
-    seconds: float = 0.0
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seconds: float = 0.0  # that loading and preparing took
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its frame
     scale: PositiveFloat = 1.0
-    statistics: dict[str, float] = field(default_factory=dict)
-    reason: str | None = None
-    detail: str = ""
-    sha256: str = ""
+    statistics: dict[str, float] = field(default_factory=dict)  # about the preparation
+    reason: str | None = None  # why the shape was rejected; None where it was not
+    detail: str = ""  # of the rejection
+    sha256: str = ""  # of all else in the file
 
 
 _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
@@ -77,13 +67,7 @@ def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
 
 
 def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) -> None:
-    """Writes one shape's file in the place of what lies there.
-
-    Args:
-        path: of the file.
-        arrays: as `arrays_of` makes them; empty for a rejected shape.
-        record: its `sha256` is filled in.
-    """
+    """Writes one shape's file: its record, and arrays as `arrays_of` makes them; none where it is rejected."""
     arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
     header = _header({name: len(array) for name, array in arrays.items()})
     digest = _digest(record, header)
@@ -128,7 +112,6 @@ class StoredShape(InFrame):
 
     Attributes:
         record: all that is known of the shape; `record.reason` is set where it was rejected.
-        frame: the way back to the source's frame.
         state: changes when the file is written anew.
 
     Raises:
