@@ -13,12 +13,9 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
-RADIUS = 1 / 1.03
-"""Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
-
+RADIUS = 1 / 1.03  # of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)
 _PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
-SHAPE_ID = rf"^{_PART}(/{_PART})*$"
-"""Pattern of a shape's id, such as `chairs/0007`: safe as a path below a folder, and none leads out of it."""
+SHAPE_ID = rf"^{_PART}(/{_PART})*$"  # such as `chairs/0007`: a path below a folder that never leads out
 
 
 def check_id(id: str) -> None:
@@ -76,8 +73,7 @@ class Frame:
         return (points - self.center) * self.scale
 
 
-NORMALIZED = Frame(np.zeros(3), 1.0)
-"""The frame of a shape that has no source: the normalised one itself."""
+NORMALIZED = Frame(np.zeros(3), 1.0)  # of a shape that has no source
 
 
 class InFrame:

@@ -24,11 +24,9 @@ from sdfhub.locks import locked
 
 log = logging.getLogger(__name__)
 
+# Debian packages and the suffix of the meshes in them; nothing else of them is unpacked
 PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
-"""Debian packages and the suffix of the meshes in them; nothing else of them is unpacked."""
-
-MAX_MEMBER = 256 << 20
-MAX_TOTAL = 2 << 30
+MAX_MEMBER, MAX_TOTAL = 256 << 20, 2 << 30
 
 
 def fetch(root: str | Path) -> None:
@@ -54,11 +52,7 @@ def fetch(root: str | Path) -> None:
 
 
 def unpack(archive: Path, folder: Path, suffix: str) -> int:
-    """Unpacks a .deb's regular files that end in `suffix`, and its copyright file; returns their number.
-
-    Raises:
-        SdfhubError: not a whole .deb, or one that holds no such file or unreasonably large ones.
-    """
+    """Unpacks a .deb's regular files that end in `suffix`, and its copyright file; returns their number."""
     count, total = 0, 0
     try:
         with _data_tar(archive) as stream, tarfile.open(fileobj=stream, mode="r|") as tar:

@@ -26,8 +26,7 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
 
     Args:
         shapes: what the source offers; the order does not matter.
-        train: number of training shapes; None takes all that are not held out.
-        held_out: number of held-out shapes.
+        train, held_out: numbers of shapes; None trains on all that are not held out.
         seed: another seed, another order.
         at_most: the numbers are upper bounds. Where there are not enough shapes, or all are trained on, no
             more than a fifth of them is held out, but one of three.

@@ -17,11 +17,9 @@ from typing import Any
 
 from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
+# what tells the numeric libraries how many threads to start; read when they are imported
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
-"""What tells the numeric libraries how many threads to start; read when they are imported."""
-
-SAFE_PATH = "PYTHONSAFEPATH"
-"""Keeps Python from importing modules of the current folder."""
+SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing modules of the current folder
 
 
 class Crashed:

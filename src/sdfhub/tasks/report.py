@@ -85,7 +85,8 @@ def truth_finder() -> FindTruth:
         key = str(cell.scores.config.get("data"))
         if key not in stores:
             stores[key] = _store(cell.scores.config)
-        return (stores[key] or {}).get(id)
+        store = stores[key]
+        return store.get(id) if store else None
 
     return find
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import lightning as L
@@ -35,11 +36,7 @@ class EpochSteps(Sampler[int]):
     """The step numbers of one epoch, from the first that has not been done.
 
     Lightning ends an epoch by itself, also one that a checkpoint of its middle resumes. Its own `set_epoch`
-    comes too early after a resume: it starts again at epoch 0.
-
-    Args:
-        steps: steps of an epoch.
-        done: gives how many steps have been done, also after a resume; None counts them here.
+    comes too early after a resume. `done` gives the steps done so far, also then; None counts them here.
     """
 
     def __init__(self, steps: int, done: Callable[[], int] | None = None):
@@ -69,8 +66,7 @@ class SdfDataModule(L.LightningDataModule):
         source: Source,
         store: str = "data/store",  # folder of prepared samples, shared by all runs
         workers: PositiveInt | None = None,  # processes that prepare shapes; None: one per core
-        shapes: PositiveInt
-        | None = None,  # to train on; None: all not held out; for a folder at most so many
+        shapes: PositiveInt | None = None,  # to train on; None: all not held out; of a folder at most so many
         held_out: NonNegativeInt = 4,  # never trained on; see `splits.split`
         split_seed: NonNegativeInt = 0,  # draws both
         preparation: Preparation = DEFAULT,
@@ -114,16 +110,14 @@ class SdfDataModule(L.LightningDataModule):
     def filled(self, roles: Split) -> Store:
         """The store with the shapes of both roles."""
         shapes = roles.train + roles.held_out
-        return stores.prepare(self.source, shapes, self.preparation, self.store, self.workers)
+        return stores.prepare(self.source, shapes, self.preparation, Path(self.store), self.workers)
 
     def prepare_part(self, part: int, parts: int) -> tuple[int, int]:
-        """Prepares one of so many parts of the shapes, 1 <= part <= parts; processes may share the work so.
-
-        Returns:
-            Shapes of the part, and how many of them were prepared now.
-        """
+        """Prepares part 1 <= `part` <= `parts` of the shapes; returns its shapes, and those prepared now."""
         own = (self.split.train + self.split.held_out)[part - 1 :: parts]
-        return len(own), stores.prepare_part(self.source, own, self.preparation, self.store, self.workers)
+        return len(own), stores.prepare_part(
+            self.source, own, self.preparation, Path(self.store), self.workers
+        )
 
     def prepare_data(self) -> None:
         """Fills the store; a second call does nothing.

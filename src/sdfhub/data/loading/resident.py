@@ -10,9 +10,9 @@ from sdfhub.data.store.stored_shape import COLUMNS, StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 
+# Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
+# Distances beyond it are cut, far outside of what the clamped loss tells apart.
 EXTENT = {"outside": 1.5, "inside": 1.5, "surface": 1.0}
-"""Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
-Distances beyond it are cut, far outside of what the clamped loss tells apart."""
 
 
 class ResidentBatches(StepBatches):

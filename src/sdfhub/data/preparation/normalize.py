@@ -7,8 +7,7 @@ from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import Frame, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-ZERO_AREA = 1e-15
-"""Area, normalised units squared, up to which a triangle counts as a line: rounding may leave so much."""
+ZERO_AREA = 1e-15  # of a line, normalised units squared: rounding may leave so much
 
 
 def normalize_mesh(

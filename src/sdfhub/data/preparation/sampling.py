@@ -16,8 +16,7 @@ from sdfhub.shapes import NormalizedMesh, ShapeSamples
 if TYPE_CHECKING:
     import trimesh
 
-PROBES = 2000
-"""Samples on which the fast path must agree with the winding number."""
+PROBES = 2000  # samples on which the fast path must agree with the winding number
 
 
 def prepare_mesh(
@@ -59,10 +58,20 @@ def prepare_mesh(
         raise RejectedMesh("ambiguous_signs", what)
     if not low <= inside <= high:
         raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
-    surface_points, surface_normals = _oriented_points(surface, preparation.surface_points, rng)
-    kept = NormalizedMesh(surface.vertices, surface.faces, normalized.frame)
-    arrays = (array.astype(np.float32) for array in (points, sdf, surface_points, surface_normals))
-    return ShapeSamples(*arrays, normalized.frame, kept, statistics)
+    surface_points, normals = np.zeros((0, 3)), np.zeros((0, 3))
+    if count := preparation.surface_points:
+        surface_points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
+        order = rng.permutation(count)
+        surface_points, normals = surface_points[order], normals[order]
+    return ShapeSamples(
+        points.astype(np.float32),
+        sdf.astype(np.float32),
+        surface_points.astype(np.float32),
+        normals.astype(np.float32),
+        normalized.frame,
+        NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
+        statistics,
+    )
 
 
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:
@@ -100,11 +109,3 @@ def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: 
     probes, sdf = points[order], sdf[order]
     inside = SIGN_METHODS["winding"](probes, nearest_points(probes, surface), surface, rng).inside
     return bool(np.mean(inside != (sdf < 0)) < 0.002)
-
-
-def _oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    if not count:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
-    order = rng.permutation(count)
-    return points[order], normals[order]

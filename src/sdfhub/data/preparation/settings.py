@@ -35,5 +35,4 @@ class Preparation:
     max_bad_faces: float = 0.03  # share of the visible area with over a tenth of them there (sign=vote)
 
 
-DEFAULT = Preparation()
-"""The paper's pipeline, with the winding number for the sign."""
+DEFAULT = Preparation()  # the paper's pipeline, with the winding number for the sign

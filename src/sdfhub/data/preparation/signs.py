@@ -16,20 +16,12 @@ from sdfhub.geometry.morton import morton_codes, morton_order
 from sdfhub.geometry.surface_sampling import points_on_faces, random_faces
 from sdfhub.triangles import face_normals
 
-VOTES = 11
-"""Neighbours that vote (DeepSDF's code)."""
-VOTERS = 250_000
-"""Visible points that may vote (DeepSDF's code: half of the samples of a shape)."""
-INNER = 0.95
-"""Part of the radius of an empty ball within which points take the winding number of its centre."""
-CLEAR = 0.1
-"""Distance of a winding number from a whole one below which other points may take it."""
-ROUGH, CLOSE = 1.0, 2.0
-"""Distances, in radii, from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3) and to 0.01."""
-ROOM = 50_000
-"""Pieces that cutting may add: it pays where few triangles are long, and memory stays bounded."""
-NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
-"""Edges above which faces are cut before a tree is built over them."""
+VOTES, VOTERS = 11, 250_000  # neighbours that vote, of how many visible points (DeepSDF's code)
+INNER = 0.95  # part of the radius of an empty ball whose points take the winding number of its centre
+CLEAR = 0.1  # distance of a winding number from a whole one below which other points may take it
+ROUGH, CLOSE = 1.0, 2.0  # radii from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3), 0.01
+NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1  # above these faces are cut before a tree is built over them
+ROOM = 50_000  # pieces that cutting may add: it pays where few triangles are long
 
 
 class Nearest(NamedTuple):

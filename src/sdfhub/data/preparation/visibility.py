@@ -23,23 +23,16 @@ from sdfhub.triangles import face_normals, piece_count
 # Read by libigl's first call: shapes run in parallel, not points.
 os.environ.setdefault("IGL_NUM_THREADS", "1")
 
-FIRST, SECOND = 16, 48
-"""Rays at every face in the first round, and at undecided ones in the second."""
-RAYS = 1_500_000
-"""Rays of a round above which a face gets fewer than that, down to half."""
-LARGE, AGAIN = 200_000, 3
-"""Rays of the first round on top, shared out by area; a face gets this many times as many in the second."""
-SURE = 0.12
-"""Share of its rays that must reach a face, all on one side, to need no others (an open side has 0.5)."""
-CHUNK = 50_000
-BAD = 0.1
-"""Share of sightings on its less seen side from which a face counts as bad."""
-STEP = 1e-3
-"""Distance from a face at which the winding number before and behind it is taken."""
-SOLID = 0.8
-"""Winding number above which the space behind a face counts as solid."""
-TOUCH = 5e-6
-"""Above a face by which a ray towards the eye starts, so that a coincident face does not stop it."""
+FIRST, SECOND = 16, 48  # rays at every face in the first round, and at undecided ones in the second
+RAYS = 1_500_000  # of a round above which a face gets fewer than that, down to half
+LARGE = 200_000  # rays of the first round on top, shared out by area
+AGAIN = 3  # times as many of these in the second
+SURE = 0.12  # share of its rays that must reach a face, all on one side, to need no others (open: 0.5)
+CHUNK = 50_000  # rays at once
+BAD = 0.1  # share of sightings on its less seen side from which a face counts as bad
+STEP = 1e-3  # distance from a face at which the winding number before and behind it is taken
+SOLID = 0.8  # winding number above which the space behind a face counts as solid
+TOUCH = 5e-6  # above a face: where a ray to the eye starts, so that a coincident face does not stop it
 
 
 @dataclass(frozen=True)
@@ -158,8 +151,7 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
 def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarray) -> np.ndarray:
     """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it.
 
-    A wall seen from within through a hole looks two-sided, but behind it the number is nearly 1. Behind a
-    sheet it is about 1/2, before it -1/2.
+    So it is at a wall seen from within through a hole, not at a sheet: there it is about 1/2 and -1/2.
     """
     normals = face_normals(vertices, suspects)
     step = STEP * normals / np.linalg.norm(normals, axis=1)[:, None]

@@ -13,12 +13,8 @@ from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NORMALIZED, Frame, ShapeSamples
 
-MAX_BYTES = 1 << 30
-"""Of one array; DeepSDF's have some 8 MB."""
-
-REACH = 1.5
-"""Along an axis: samples lie near shapes in the unit ball, or anywhere in the cube [-1, 1]^3."""
-
+MAX_BYTES = 1 << 30  # of one array; DeepSDF's have some 8 MB
+REACH = 1.5  # along an axis: samples lie near shapes in the unit ball, or in the cube [-1, 1]^3
 _SAMPLES, _PARAMETERS = "SdfSamples", "NormalizationParameters"
 
 

@@ -13,10 +13,8 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Mesh
 
 FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
-MAX_BYTES = 1 << 30
-"""A larger file is refused before it is read: text formats take some ten times their size in memory."""
-MAX_VERTICES = 50_000_000
-"""Of a glTF's scene: a small file may draw one mesh many times."""
+MAX_BYTES = 1 << 30  # of a file: text formats take some ten times their size in memory
+MAX_VERTICES = 50_000_000  # of a glTF's scene: a small file may draw one mesh many times
 
 _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
 

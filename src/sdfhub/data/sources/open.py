@@ -21,14 +21,9 @@ from sdfhub.shapes import Mesh
 from sdfhub.triangles import face_normals
 from sdfhub.whole_file import write_whole
 
-MEASURES = ".measured.json"
-"""Cache below the root: faces, extents, area and hash of the models seen so far, by file size and date."""
-
+MEASURES = ".measured.json"  # a cache: faces, size and hash of the models seen so far, by file and date
 CATALOGUE = "PluginFurnitureCatalog.properties"
-MAX_CATALOGUE = 16 << 20
-MAX_MODEL = 256 << 20
-"""Bytes of one unpacked model: a small archive may claim any size."""
-
+MAX_CATALOGUE, MAX_MODEL = 16 << 20, 256 << 20  # bytes unpacked: a small archive may claim any size
 AIRCRAFT_CREDITS = {"author": "the FlightGear team", "licence": "GPL-2+"}
 
 

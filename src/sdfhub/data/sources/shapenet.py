@@ -12,8 +12,7 @@ from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh
 
-LAYOUTS = ("models/model_normalized.obj", "model.obj")
-"""Where a model's mesh lies in its folder: version 2, version 1."""
+LAYOUTS = ("models/model_normalized.obj", "model.obj")  # of a model's mesh: version 2, version 1
 
 
 class Category(BaseModel):

@@ -20,9 +20,9 @@ class SourceOfFiles(Source):
 
     Args:
         kind: beginning of its name.
-        root: the folder that holds the files; relative paths hold from anywhere afterwards.
-        train_split: file listing the training shapes; see `with_roles`. None lets a seed decide.
-        test_split: the same for held-out shapes. Where either is given, unlisted shapes are left out.
+        root: the folder that holds the files.
+        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
+            either is given, unlisted shapes are left out. None lets a seed decide.
     """
 
     def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
@@ -62,12 +62,7 @@ def with_roles(
 
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
     of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
-    name is the path of a shape's file, or its last parts, without the suffix.
-
-    Args:
-        shapes: with their paths below the source's root, without suffix.
-        train_split: file that lists the training shapes, or None.
-        test_split: file that lists the held-out shapes, or None.
+    name is the path of a shape's file below the root, as beside each shape, or its last parts, without suffix.
 
     Raises:
         SdfhubError: a file is missing or of another form, lists nothing that is there, or both list a shape.

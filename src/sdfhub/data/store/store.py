@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -37,13 +37,9 @@ from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-VERSION = 3
-"""Of the layout on disk and of how samples are made; stores of another version are not reused."""
-
+VERSION = 3  # of the layout on disk and of how samples are made; other stores are not reused
 INDEX = "index.json"
-
-TRIED_AGAIN = ("error", "crash")
-"""Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
+TRIED_AGAIN = ("error", "crash")  # reasons that lie in the machine or the program rather than the mesh
 
 
 class Store(dict[str, StoredShape]):
@@ -68,7 +64,7 @@ class Store(dict[str, StoredShape]):
         ids = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
         if not ids:
             raise SdfhubError(f"{folder}: holds no prepared shapes; run `sdfhub prepare` first")
-        return cls(folder, _read(folder, ids, up).values())
+        return cls(folder, _read(folder, ids, up, logging.WARNING).values())
 
     def __missing__(self, id: str) -> StoredShape:
         why = f"was rejected: {self.rejected[id].reason}" if id in self.rejected else "is not there"
@@ -86,11 +82,7 @@ class Store(dict[str, StoredShape]):
 
 
 def prepare(
-    source: Source,
-    shapes: list[Shape],
-    preparation: Preparation,
-    root: str | Path,
-    workers: int | None = None,
+    source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> Store:
     """The store holding `shapes`, preparing those that it lacks.
 
@@ -108,20 +100,19 @@ def prepare(
     Raises:
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
-    folder = Path(root) / source.name / preparation_hash(preparation)
-    about = {"source": source.name} | asdict(preparation)
-    stored = _checked(folder, shapes, source.up, about, logging.DEBUG)
+    folder = root / source.name / preparation_hash(preparation)
+    stored = _checked(folder, shapes, source, preparation, quiet=True)
     if _left(shapes, stored):
         waiting = f"store: {folder}: waiting for another process that prepares it"
         with _writing(folder), locked(folder / ".lock", waiting=waiting):
             _remove_leftovers(folder)
             # another process may have filled it meanwhile
-            left = _left(shapes, _checked(folder, shapes, source.up, about))
+            left = _left(shapes, _checked(folder, shapes, source, preparation))
             for shape, is_crash in _prepared(source, left, preparation, folder, workers):
                 if is_crash:
                     what = "the worker process died: out of memory, or a fault in a native library"
-                    write_shape(_file(folder, shape.id), {}, _rejection(shape, "crash", what))
-        stored = _checked(folder, shapes, source.up, about)
+                    write_shape(_file(folder, shape.id), {}, _record(shape, "crash", what))
+        stored = _checked(folder, shapes, source, preparation)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
         what = "; ".join(line.strip() for line in store.summary().splitlines())
@@ -130,22 +121,17 @@ def prepare(
 
 
 def prepare_part(
-    source: Source,
-    shapes: list[Shape],
-    preparation: Preparation,
-    root: str | Path,
-    workers: int | None = None,
+    source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> int:
     """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
 
     Returns:
         How many were prepared or rejected; those whose worker died are left to the next call.
     """
-    folder = Path(root) / source.name / preparation_hash(preparation)
+    folder = root / source.name / preparation_hash(preparation)
     with _writing(folder):
-        left = _left(shapes, _checked(folder, shapes, source.up))
-        results = _prepared(source, left, preparation, folder, workers)
-        return sum(not is_crash for _, is_crash in results)
+        left = _left(shapes, _checked(folder, shapes, source, preparation))
+        return sum(not is_crash for _, is_crash in _prepared(source, left, preparation, folder, workers))
 
 
 def preparation_hash(preparation: Preparation) -> str:
@@ -169,23 +155,19 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
         samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
         arrays = arrays_of(samples, seed)
         x, y, z = samples.center.tolist()
-        record = Record(
-            shape.fingerprint,
-            shape.category,
-            shape.credits,
-            center=(x, y, z),
-            scale=float(samples.scale),
-            statistics={name: float(value) for name, value in samples.statistics.items()},
+        statistics = {name: float(value) for name, value in samples.statistics.items()}
+        record = replace(
+            _record(shape, None), center=(x, y, z), scale=float(samples.scale), statistics=statistics
         )
     except RejectedMesh as rejection:
-        record = _rejection(shape, rejection.reason, rejection.detail)
+        record = _record(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
-        record = _rejection(shape, "error", f"{type(error).__name__}: {error}")
+        record = _record(shape, "error", f"{type(error).__name__}: {error}")
     seconds = round(time.perf_counter() - start, 4)
     write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
-def _rejection(shape: Shape, reason: str, detail: str) -> Record:
+def _record(shape: Shape, reason: str | None, detail: str = "") -> Record:
     detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
     return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
 
@@ -196,9 +178,7 @@ def _prepared(
     """Each shape when it is prepared, and whether its worker died on it."""
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
     function = partial(prepare_shape, source, preparation, folder)
-    results: Iterator[tuple[int, Any]] = enumerate(map(function, left))
-    if workers > 1:
-        results = map_in_processes(function, left, workers)
+    results = map_in_processes(function, left, workers) if workers > 1 else enumerate(map(function, left))
     # disable=None: no bar where nobody watches
     bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
     return ((left[index], isinstance(result, Crashed)) for index, result in bar)
@@ -215,9 +195,7 @@ def _file(folder: Path, id: str) -> Path:
     return folder / f"{id}{SUFFIX}"
 
 
-def _read(
-    folder: Path, ids: Iterable[str], up: Literal["y", "z"] = "z", level: int = logging.WARNING
-) -> dict[str, StoredShape]:
+def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -> dict[str, StoredShape]:
     """The stored shapes of some ids, in their order, without those that are missing or clearly damaged."""
     paths = {id: _file(folder, id) for id in ids}
     for parent in {path.parent for path in paths.values()}:
@@ -235,17 +213,14 @@ def _read(
 
 
 def _checked(
-    folder: Path,
-    shapes: list[Shape],
-    up: Literal["y", "z"],
-    about: dict[str, Any] | None = None,
-    level: int = logging.WARNING,
+    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, quiet: bool = False
 ) -> dict[str, StoredShape]:
-    """The stored shapes whose files are intact, by id; damage is logged at `level`.
+    """The stored shapes whose files are intact, by id; damage is logged.
 
     The index notes which files are intact, and for a reader what the store was made of.
     """
-    stored = _read(folder, [shape.id for shape in shapes], up, level)
+    level = logging.DEBUG if quiet else logging.WARNING
+    stored = _read(folder, [shape.id for shape in shapes], source.up, level)
     try:
         known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]
         changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
@@ -256,7 +231,8 @@ def _checked(
     for id in [id for id, is_intact in intact.items() if not is_intact]:
         log.log(level, "store: %s: damaged (checksum): to be prepared again", stored.pop(id).path)
     states = {id: stored[id].state for id in changed if id in stored}
-    if states and about:
+    if states:
+        about = {"source": source.name} | asdict(preparation)
         index = {"about": about, "checked": dict(sorted((known | states).items()))}
         with suppress(OSError):  # a store that others own is read all the same
             write_whole(folder / INDEX, json.dumps(index, indent=1))

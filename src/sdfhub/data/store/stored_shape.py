@@ -23,10 +23,9 @@ from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
 
+# position, (x, y, z, sdf) twice, (point, normal), vertex indices: in their order in a file, so that all are
+# aligned the one of 8 bytes a number first
 COLUMNS = {"vertices": 3, "outside": 4, "inside": 4, "surface": 6, "faces": 3}
-"""Columns of each array, in their order in a file: position, (x, y, z, sdf) twice, (point, normal), vertex
-indices. The one of 8 bytes a number comes first, so that all are aligned."""
-
 DTYPES = {"vertices": "<f8", "outside": "<f4", "inside": "<f4", "surface": "<f4", "faces": "<i4"}
 _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
@@ -67,7 +66,7 @@ def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
 
 
 def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) -> None:
-    """Writes one shape's file: its record, and arrays as `arrays_of` makes them; none where it is rejected."""
+    """Writes one shape's file: its record, and arrays as `arrays_of` makes them, none if rejected."""
     arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
     header = _header({name: len(array) for name, array in arrays.items()})
     digest = _digest(record, header)
