@@ -62,7 +62,7 @@ def with_roles(
 
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
     of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
-    name is the path of a shape's file below the root, as beside each shape, or its last parts, without suffix.
+    name is the path of a file below the root, as beside each shape, or its last parts, without suffix.
 
     Raises:
         SdfhubError: a file is missing or of another form, lists nothing that is there, or both list a shape.

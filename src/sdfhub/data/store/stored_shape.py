@@ -7,8 +7,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BufferedReader
 from pathlib import Path
@@ -29,7 +28,6 @@ COLUMNS = {"vertices": 3, "outside": 4, "inside": 4, "surface": 6, "faces": 3}
 DTYPES = {"vertices": "<f8", "outside": "<f4", "inside": "<f4", "surface": "<f4", "faces": "<i4"}
 _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
-NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 @dataclass(frozen=True)
@@ -184,12 +182,16 @@ class StoredShape(InFrame):
         if not len(rows):
             return
         start %= self.rows(name)
-        with self._unchanged() as file:
-            while len(rows):
-                part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
-                file.seek(self._offsets[name] + start * part.strides[0])
-                file.readinto(part.data.cast("B"))
-                start = 0
+        try:
+            with self._open() as file:
+                self._refuse_other_size(file)
+                while len(rows):
+                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                    file.seek(self._offsets[name] + start * part.strides[0])
+                    file.readinto(part.data.cast("B"))
+                    start = 0
+        except (OSError, ValueError) as error:
+            raise self._broken(error) from error
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
@@ -202,24 +204,27 @@ class StoredShape(InFrame):
             return False
 
     def _open(self) -> BufferedReader:
-        return open(self.path, "rb", opener=lambda path, flags: os.open(path, flags | NO_LINKS))
+        return open(self.path, "rb", opener=_without_links)
 
     def _map(self, name: str) -> np.ndarray:
         shape = (self.rows(name), COLUMNS[name])
         if not shape[0]:  # an empty file cannot be mapped
             return np.zeros(shape, dtype=DTYPES[name])
-        with self._unchanged() as file:
-            return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
-
-    @contextmanager
-    def _unchanged(self) -> Iterator[BufferedReader]:
-        """The open file, of the size that it had."""
         try:
             with self._open() as file:
-                if (size := os.fstat(file.fileno()).st_size) != self._size:
-                    raise ValueError(f"it has {size} bytes, not {self._size}")
-                yield file
+                self._refuse_other_size(file)
+                return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
         except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-            what = f"{why}; start or prepare again: damaged shapes are prepared anew"
-            raise SdfhubError(f"{self.path}: {what}") from error
+            raise self._broken(error) from error
+
+    def _refuse_other_size(self, file: BufferedReader) -> None:
+        if (size := os.fstat(file.fileno()).st_size) != self._size:
+            raise ValueError(f"it has {size} bytes, not {self._size}")
+
+    def _broken(self, error: Exception) -> SdfhubError:
+        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
+        return SdfhubError(f"{self.path}: {why}; start or prepare again: damaged shapes are prepared anew")
+
+
+def _without_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))
