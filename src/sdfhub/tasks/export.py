@@ -18,7 +18,6 @@ from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import FORMATS, write_mesh
 from sdfhub.model.decoder import Decoder
 from sdfhub.opening import beside, load, write_space
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import write_whole
 
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
@@ -115,8 +114,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(logging.NOTSET)
-
-
-def main() -> None:
-    """Console entry: `sdfhub export RUN TO`."""
-    run_task(export, "export", ["run", "to"])

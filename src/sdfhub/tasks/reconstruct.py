@@ -26,7 +26,6 @@ from sdfhub.scans.scan import FORMATS
 from sdfhub.scans.simulated import ScanKind
 from sdfhub.shapes import NORMALIZED
 from sdfhub.space import Space
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
@@ -184,8 +183,3 @@ def reconstruct(config: DictConfig) -> None:
     """The task: `config` as conf/reconstruct.yaml has it."""
     if any(result.verdict == "failed" for result in reconstruct_run(config)):
         sys.exit(1)
-
-
-def main() -> None:
-    """Console entry: `sdfhub reconstruct RUN SCAN ...`. Exit status 1 if a scan failed."""
-    run_task(reconstruct, "reconstruct", ["run", "scans..."])

@@ -35,7 +35,6 @@ from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
@@ -69,7 +68,7 @@ class Parts:
     evaluation: Evaluation
 
 
-def train(config: DictConfig, folder: Path) -> dict[str, Any]:
+def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Trains what a composed config describes into a folder.
 
     Returns:
@@ -247,17 +246,12 @@ def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]
         logger.save()
 
 
-def run(config: DictConfig) -> float | None:
+def train(config: DictConfig) -> float | None:
     """One run, or one cell of a multirun, of a composed config with Hydra's own part set."""
     hydra = HydraConfig.get()
     if config.print_config:
         log.info(OmegaConf.to_yaml(config))
     if hydra.mode == RunMode.MULTIRUN:
-        return objective(run_cell(train, config, hydra))
-    go_on(train, config, Path(hydra.runtime.output_dir))
+        return objective(run_cell(train_into, config, hydra))
+    go_on(train_into, config, Path(hydra.runtime.output_dir))
     return None
-
-
-def main() -> None:
-    """Console entry: `python train.py activation=hosc encoding=fourier`."""
-    run_task(run, "config")
