@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from omegaconf import DictConfig
 from pydantic import Field
@@ -71,7 +71,7 @@ def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]
     return reconstructor, instantiate(config.calibration, "calibration")
 
 
-def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
+def scan_frame(space: Space, frame: Any, of: str | int | None) -> ScanFrame:
     """Where scans lie.
 
     Args:
@@ -82,8 +82,10 @@ def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
     check(frame, Literal["shape", "normalised", "source", "unknown"], "frame")
     if of is not None and frame != "source":
         raise SdfhubError(f"of={of}: needs frame=source")
-    if frame != "source":
-        return NORMALIZED if frame == "normalised" else frame
+    if frame == "normalised":
+        return NORMALIZED
+    if frame in ("shape", "unknown"):
+        return frame
     if of is not None:
         id = space.ids[space.row(of)]
         if id not in space.frames:
@@ -125,7 +127,7 @@ def limits_of(
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     if not calibration.shapes:
         return {}
-    settings = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
+    settings: dict[str, Any] = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
     settings["poses"] = plain(config.poses) if reconstructor.poses else None
     try:
         return calibration.limits(
