@@ -183,8 +183,9 @@ def make_trainer(
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
-    for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
-        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
+    # what hardware there is not, advertisements, defaults of Lightning's own files
+    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     return trainer
 
 
