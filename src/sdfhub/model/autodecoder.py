@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -82,11 +82,9 @@ class AutoDecoder(L.LightningModule):
         """
         path = Path(checkpoint_path)
         content = read_checkpoint(path, map_location)
-        parameters, weights = content.get("hyper_parameters"), content.get("state_dict")
-        model = model_with_weights(
-            lambda: cls(**built_parts(parameters, path, trust)), parameters, weights, path
-        )
-        return model.to(map_location)
+        parameters = content.get("hyper_parameters")
+        make = lambda: cls(**built_parts(parameters, path, trust))  # noqa: E731
+        return model_with_weights(make, parameters, content.get("state_dict"), path).to(map_location)
 
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of the shapes in table rows [B]."""
@@ -101,7 +99,7 @@ class AutoDecoder(L.LightningModule):
     def on_fit_end(self) -> None:
         # Lightning has moved the model to the CPU by now, and of the plain encoding its weights alone
         self.decoder.encoding = self.decoder.encoding.plain().to(self.device)
-        self.computing.put_back()
+        torch.set_float32_matmul_precision("highest")  # what is trained is judged with all its digits
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         batches = self.trainer.accumulate_grad_batches
@@ -110,9 +108,8 @@ class AutoDecoder(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss, parts = self.objective(batch, self.progress)
-        if not torch.isfinite(loss):
-            self._refuse_divergence("loss", parts)
-        every = self.trainer.log_every_n_steps  # 0: nothing is logged
+        self._refuse_divergence("loss", {name: part.detach() for name, part in parts.items()})
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined] # 0: nothing is logged
         if every and (self.global_step + 1) % every == 0:
             self._log(batch, parts, loss)
         return loss
@@ -157,12 +154,9 @@ class AutoDecoder(L.LightningModule):
         # this has opened the data loader; a resumed training opens it again, once it knows its step
         self.trainer.fit_loop._combined_loader = None
         if math.isinf(self.steps):
-            raise SdfhubError(
-                "trainer.max_epochs: schedules and warm-ups are shares of a training; set it or max_steps"
-            )
-        optimizer, schedule = self.optim.configure(
-            self.decoder.parameters(), self.codes.parameters(), int(self.steps)
-        )
+            raise SdfhubError("trainer.max_epochs: set it or max_steps; schedules are shares of a training")
+        weights = self.decoder.parameters(), self.codes.parameters()
+        optimizer, schedule = self.optim.configure(*weights, steps=int(self.steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(
@@ -170,22 +164,20 @@ class AutoDecoder(L.LightningModule):
     ) -> None:
         # Lightning clips no gradients of a fused optimiser under mixed precision, for fear of a loss scale
         if gradient_clip_val is not None and gradient_clip_val > 0:
-            weights = [p for group in optimizer.param_groups for p in group["params"]]
             by_value = gradient_clip_algorithm == "value"
             clip = torch.nn.utils.clip_grad_value_ if by_value else torch.nn.utils.clip_grad_norm_
-            clip(weights, gradient_clip_val)
+            clip(self.parameters(), gradient_clip_val)
 
     def on_before_optimizer_step(self, optimizer) -> None:
-        gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
-        if not torch.isfinite(torch.nn.utils.get_total_norm(gradients.values())):
-            self._refuse_divergence("gradient", gradients)
+        weights = self.named_parameters()
+        self._refuse_divergence("gradient", {name: p.grad for name, p in weights if p.grad is not None})
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        weights = dict(self.named_parameters())
-        if not torch.isfinite(torch.nn.utils.get_total_norm(weights.values())):
-            self._refuse_divergence("model", weights)
+        self._refuse_divergence("model", dict(self.named_parameters()))
 
-    def _refuse_divergence(self, what: str, parts: dict[str, Tensor]) -> None:
+    def _refuse_divergence(self, what: str, parts: Mapping[str, Tensor]) -> None:
+        if torch.isfinite(torch.nn.utils.get_total_norm(parts.values())):
+            return
         wrong = [name for name, part in parts.items() if not torch.isfinite(part).all()]
         culprits = f"{', '.join(wrong[:3])}{' ...' * (len(wrong) > 3)}" if wrong else "its norm"
         raise SdfhubError(

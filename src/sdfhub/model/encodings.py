@@ -7,19 +7,15 @@ the normal loss differentiates the field's spatial gradient by the weights. It m
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from sdfhub.described import Described
-from sdfhub.model.derivatives import value_and_pullback
+from sdfhub.model.derivatives import Pullback, value_and_pullback
 
 PRIMES = (1, 2_654_435_761, 805_459_861)
 """Factors of the spatial hash. Source: Mueller et al. 2022, section 3."""
-
-Pullback = Callable[[Tensor], Tensor]
-"""From a cotangent of the features [..., F] to one of the points [..., 3]."""
 
 
 class Encoding(Described, nn.Module, ABC):
@@ -45,27 +41,24 @@ class Encoding(Described, nn.Module, ABC):
 
 
 class OfModule(Encoding):
-    """Any module from points [..., 3] to features [..., F], with an attribute `features`, as an encoding."""
+    """A module from points [..., 3] to features [..., F], with an attribute `features`, as an encoding."""
 
-    def __init__(self, module: nn.Module):
+    def __init__(self, module: nn.Module, features: int):
         super().__init__()
-        self.module, self.features = module, module.features
+        self.module, self.features = module, features
 
     def forward(self, points: Tensor) -> Tensor:
         return self.module(points)
 
 
 def as_encoding(module: nn.Module) -> Encoding:
-    """The encoding itself, or a module as one.
-
-    Raises:
-        ValueError: it is no module, or has no number of features.
-    """
+    """An encoding itself, or a module as one; raises a ValueError where it has no integer `features`."""
     if isinstance(module, Encoding):
         return module
-    if not isinstance(module, nn.Module) or not isinstance(getattr(module, "features", None), int):
+    features = getattr(module, "features", None)
+    if not isinstance(module, nn.Module) or not isinstance(features, int):
         raise ValueError("encoding must be a torch.nn.Module with an integer attribute `features`")
-    return OfModule(module)
+    return OfModule(module, features)
 
 
 class Identity(Encoding):
@@ -81,12 +74,7 @@ class Identity(Encoding):
 
 
 class Waves(Encoding):
-    """sin and cos of angles that are linear in x: F = 2 A (+ 3), for A angles.
-
-    Args:
-        angles: A.
-        include_points: whether the coordinates themselves come first among the features.
-    """
+    """sin and cos of A angles that are linear in x, after x itself where `include_points`: F = 2 A (+ 3)."""
 
     def __init__(self, angles: int, include_points: bool):
         super().__init__()
@@ -129,6 +117,8 @@ class Fourier(Waves):
         include_points: whether the coordinates themselves come first among the features.
     """
 
+    octaves: Tensor
+
     def __init__(self, frequencies: int, include_points: bool = False):
         super().__init__(3 * frequencies, include_points)
         if frequencies < 1:
@@ -151,6 +141,8 @@ class Gaussian(Waves):
         rows: number of random directions, >= 1.
         sigma: standard deviation of their entries, in cycles per unit of the normalised frame, > 0.
     """
+
+    directions: Tensor
 
     def __init__(self, rows: int, sigma: float):
         super().__init__(rows, include_points=False)
@@ -183,14 +175,11 @@ class Hash(Encoding):
             between shapes).
     """
 
+    cells: Tensor
+    starts: Tensor
+
     def __init__(
-        self,
-        levels: int,
-        width: int,
-        log2_table: int,
-        coarsest: int,
-        finest: int,
-        include_points: bool = True,
+        self, levels: int, width: int, log2_table: int, coarsest: int, finest: int, include_points: bool = True
     ):
         super().__init__()
         if min(levels, width, coarsest) < 1 or finest < coarsest or not 1 <= log2_table <= 30:
@@ -206,7 +195,7 @@ class Hash(Encoding):
         self.features = levels * width + 3 * include_points
         self.table = nn.Parameter(torch.empty(sum(self.rows), width).uniform_(-1e-4, 1e-4))
         self.register_buffer("cells", torch.tensor(cells), persistent=False)
-        self.register_buffer("first", torch.tensor([0, *self.rows]).cumsum(0)[:-1], persistent=False)
+        self.register_buffer("starts", torch.tensor([0, *self.rows]).cumsum(0)[:-1], persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
         return self._encode(points)[0]
@@ -229,9 +218,9 @@ class Hash(Encoding):
         return features, pullback
 
     def _encode(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-        """Features and what they are made of, for P points in all, K levels and C features a level.
+        """Features and what they are made of, for P points, K levels and C features a level.
 
-        Points are the last axis while it is worked on: long rows are what a CPU is fast at.
+        Points are the last axis: long rows are what a CPU is fast at.
 
         Returns:
             features: [..., F].
@@ -254,15 +243,11 @@ class Hash(Encoding):
         return features, corners, (x, y, z), 3 * t * (1 - t) * self.cells[:, None]
 
     def _rows_of(self, low: Tensor) -> Tensor:
-        """Table rows [2, 2, 2, K, P] of the corners of cells with low corners [3, K, P].
-
-        A grid that fits its table is indexed directly, the others by the spatial hash. Each axis is worked
-        out for its two vertices before they are combined into eight.
-        """
+        """Table rows [2, 2, 2, K, P] of the corners of cells with low corners [3, K, P]."""
         pairs = torch.stack([low, low + 1], dim=1)  # [3, 2, K, P]
         last = self.cells[: self.dense, None]
         x, y, z = torch.minimum(pairs[:, :, : self.dense].clamp(min=0), last)  # jitter may leave the cube
         fitting = ((x[:, None] * (last + 1) + y)[:, :, None] * (last + 1)) + z
         x, y, z = (axis * prime for axis, prime in zip(pairs[:, :, self.dense :], PRIMES, strict=True))
         hashed = ((x[:, None] ^ y)[:, :, None] ^ z) % max(self.rows)
-        return torch.cat([fitting, hashed], dim=-2) + self.first[:, None]
+        return torch.cat([fitting, hashed], dim=-2) + self.starts[:, None]

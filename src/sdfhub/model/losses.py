@@ -3,8 +3,9 @@
 A rival is a subclass of `Loss` that overrides `__call__` or, to have its terms logged apart, `parts`.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from pydantic.dataclasses import dataclass
 from torch import Tensor
@@ -29,24 +30,14 @@ def clamped_l1(predicted: Tensor, target: Tensor, delta: float) -> Tensor:
 
 
 def code_prior(codes: Tensor, norm: Literal["squared", "l2"]) -> Tensor:
-    """Mean over shapes of |z|^2 (both papers) or |z| (DeepSDF's published code): a scalar.
-
-    Args:
-        codes: [B, L].
-        norm: which of the two.
-    """
+    """Mean over the shapes of codes [B, L] of |z|^2 (both papers) or |z| (DeepSDF's code): a scalar."""
     squared = codes.square().sum(dim=-1)
     # the floor keeps the derivative of the root finite at z = 0
     return squared.mean() if norm == "squared" else squared.clamp(min=1e-12).sqrt().mean()
 
 
 def normal_term(gradients: Tensor, normals: Tensor) -> Tensor:
-    """Mean over points of |grad_x f - n|^2: a scalar. Source: the paper's final loss.
-
-    Args:
-        gradients: [B, M, 3] spatial gradients of the field on the surface.
-        normals: [B, M, 3] outward unit normals there.
-    """
+    """Mean over points of |grad_x f - n|^2, both [B, M, 3]: a scalar. Source: the paper's final loss."""
     return (gradients - normals).square().sum(dim=-1).mean()
 
 
@@ -64,17 +55,9 @@ class Loss(Described):
         """Whether spatial gradients are given at this share of training, in [0, 1]; they cost time."""
         return False
 
-    def __call__(
-        self,
-        predicted: Tensor,
-        target: Tensor,
-        codes: Tensor,
-        gradients: Tensor | None,
-        normals: Tensor | None,
-        progress: float,
-    ) -> Tensor:
+    def __call__(self, *arguments: Any, **named: Any) -> Tensor:
         """The loss, a scalar; arguments as in `parts`."""
-        return sum(self.parts(predicted, target, codes, gradients, normals, progress).values())
+        return torch.stack(tuple(self.parts(*arguments, **named).values())).sum()
 
     def parts(
         self,
@@ -137,10 +120,8 @@ class SdfLoss(Loss):
     ) -> dict[str, Tensor]:
         """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
-        parts = {
-            "sdf": clamped_l1(predicted, target, self.delta),
-            "code": self.lambda_code * warmup * code_prior(codes, self.code_norm),
-        }
-        if gradients is not None:
+        parts = {"sdf": clamped_l1(predicted, target, self.delta)}
+        parts["code"] = self.lambda_code * warmup * code_prior(codes, self.code_norm)
+        if gradients is not None and normals is not None:
             parts["normal"] = self.tau * normal_term(gradients, normals)
         return parts

@@ -1,6 +1,7 @@
 """A model from what a file holds: descriptions of its parts, and weights that agree with them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,27 +45,18 @@ def saved_decoder(
     Raises:
         SdfhubError: the weights are those of another decoder.
     """
-
-    def make() -> Decoder:
-        return built(description, "decoder", trust, within="sdfhub.model")
-
+    make = partial(built, description, "decoder", trust, within="sdfhub.model")
     decoder = model_with_weights(make, description, weights, path)
     return decoder.eval().requires_grad_(False)
 
 
 def model_with_weights(make: Callable[[], Model], description: Any, weights: Any, path: Path) -> Model:
-    """A model with its weights. Nothing is made that is larger than the weights.
+    """The model that `make` makes of a description, with its `state_dict`.
 
-    A few bytes of description could ask for a model without bounds.
-
-    Args:
-        make: the untrained model of the description.
-        description: plain data; its node `decoder`, or all of it.
-        weights: the model's `state_dict`.
-        path: the file, for messages.
+    Nothing is made that is larger than the weights: a few bytes of description could ask for any size.
 
     Raises:
-        SdfhubError: the description is none, or that of another model.
+        SdfhubError: the description is none, or that of another model; names the file.
     """
     _refuse_outsized(description, weights, path)
     try:

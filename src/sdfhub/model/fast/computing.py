@@ -25,11 +25,6 @@ TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 LEAST = 2**10
 """Samples that are worth a thread of their own."""
 
-_NO_TWIN = (
-    "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
-    "tiny-cuda-nn built for it; null takes it where it is there"
-)
-
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
 
 
@@ -68,34 +63,22 @@ class Computing:
         torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
         keep_freed_memory()
 
-    @staticmethod
-    def put_back() -> None:
-        """Products are exact again, as PyTorch begins: what is trained is judged with all its digits."""
-        torch.set_float32_matmul_precision("highest")
-
     def quickest(self, encoding: Encoding, device: torch.device) -> Encoding:
         """The encoding, or its twin by tiny-cuda-nn.
 
         Raises:
             SdfhubError: the twin was asked for, and there is none here that agrees.
         """
-        self.refuse_impossible(encoding, device)
-        exact = self.tinycudann is None and torch.are_deterministic_algorithms_enabled()
-        if self.tinycudann is False or exact or not can_fuse(encoding, device):
-            return encoding
-        twin = fused(encoding)
+        wanted = self.tinycudann or (
+            self.tinycudann is None and not torch.are_deterministic_algorithms_enabled()
+        )
+        twin = fused(encoding) if wanted and can_fuse(encoding, device) else encoding
         if self.tinycudann and twin is encoding:
-            raise SdfhubError(_NO_TWIN)
+            raise SdfhubError(
+                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
+                "tiny-cuda-nn built for it; null takes it where it is there"
+            )
         return twin
-
-    def refuse_impossible(self, encoding: Encoding, device: torch.device) -> None:
-        """Refuses to train by what is not there, before anything is prepared.
-
-        Raises:
-            SdfhubError: tiny-cuda-nn was asked for, where it cannot be.
-        """
-        if self.tinycudann and not can_fuse(encoding, device):
-            raise SdfhubError(_NO_TWIN)
 
     def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
         """The functions themselves, or what `torch.compile` makes of them on this device.
@@ -110,9 +93,8 @@ class Computing:
 
 
 def can_compile(device: torch.device) -> bool:
-    """Whether what `torch.compile` needs beside PyTorch for a GPU is there."""
-    tools = shutil.which(os.environ.get("CC", "cc")) and find_spec("triton")
-    return device.type == "cuda" and bool(tools)
+    """Whether it is a GPU, and what `torch.compile` needs for it beside PyTorch is there."""
+    return device.type == "cuda" and bool(shutil.which(os.environ.get("CC", "cc")) and find_spec("triton"))
 
 
 def plain_if_broken(fast: Callable) -> Callable:
@@ -142,10 +124,9 @@ def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
 
 
 def keep_freed_memory() -> None:
-    """Lets this process keep blocks it has freed, up to a GiB, where the C library is glibc.
+    """Lets this process keep blocks it has freed, up to a GiB and for all threads, where the C library is glibc.
 
-    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step. Threads
-    share what is kept, or each would have its own.
+    Else the layers' outputs go back to the system and are fetched again, zeroed, at every step.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt

@@ -1,8 +1,6 @@
 """A large batch in pieces: the gradient of the whole in the memory of a part, on all cores.
 
-DeepSDF's paper batch is a million points; the activations of all of them at once would take tens of
-gigabytes, and on a CPU even a few thousand leave its caches. A core that works on pieces of its own waits for
-no other.
+At once the activations of DeepSDF's batch, a million points, would take tens of gigabytes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -83,13 +81,12 @@ class _Summed(torch.autograd.Function):
     def forward(
         ctx, shares: Sequence[Sequence[Callable[[], Parts]]], totals: Parts, *parameters: Tensor
     ) -> Tensor:
-        (sums, ctx.gradients), *others = side_by_side(
-            lambda share: _differentiated(share, parameters), shares
-        )
-        totals.update(sums)
-        for sums, gradients in others:
+        sums = side_by_side(lambda share: _differentiated(share, parameters), shares)
+        (parts, ctx.gradients), *rest = sums
+        totals.update(parts)
+        for parts, gradients in rest:
             torch._foreach_add_(ctx.gradients, gradients)
-            for name, part in sums.items():
+            for name, part in parts.items():
                 totals[name] = totals[name] + part
         return torch.stack(tuple(totals.values())).sum()
 
@@ -103,17 +100,13 @@ def _differentiated(
 ) -> tuple[Parts, list[Tensor]]:
     """Sums of the parts of the loss over pieces, and its gradient, one piece after the other."""
     totals: Parts = {}
-    gradients: list[Tensor] = []
+    gradients = [torch.zeros_like(parameter) for parameter in parameters]
     for parts_of_piece in share:
         with torch.enable_grad():
             parts = parts_of_piece()
             loss = torch.stack(tuple(parts.values())).sum()
         with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
-            by_piece = torch.autograd.grad(loss, parameters, materialize_grads=True)
-        if gradients:
-            torch._foreach_add_(gradients, by_piece)
-        else:
-            gradients = list(by_piece)
+            torch._foreach_add_(gradients, torch.autograd.grad(loss, parameters, materialize_grads=True))
         for name, part in parts.items():
-            totals[name] = totals.get(name, 0) + part.detach()
+            totals[name] = totals.get(name, torch.zeros_like(part)) + part.detach()
     return totals, gradients
