@@ -7,8 +7,8 @@ comes from a file: only classes of sdfhub and of packages that the caller trusts
 
 import dataclasses
 import functools
-import importlib
 import inspect
+import pkgutil
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ class Described:
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
         if "__init__" in vars(cls):
-            cls.__init__ = _remembering(cls.__init__)
+            cls.__init__ = _remembering(cls.__init__)  # type: ignore[method-assign]
 
 
 def _remembering(initialise: Callable) -> Callable:
@@ -48,14 +48,10 @@ def _remembering(initialise: Callable) -> Callable:
 
 
 def describe(value: Any, key: str = "") -> Any:
-    """An object as plain data: numbers, strings, lists and mappings.
-
-    Args:
-        value: plain data, a class, a `functools.partial`, a dataclass or a `Described`, nested at will.
-        key: what the value is, for messages.
+    """Plain data, a class, a `functools.partial`, a dataclass or a `Described`, nested at will, as plain data.
 
     Raises:
-        SdfhubError: an object that cannot say how it was made.
+        SdfhubError: an object that cannot say how it was made; names `key`.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -90,7 +86,7 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
         node: plain data; mappings with `_target_` become objects, wherever they stand.
         key: what the description is of, for messages.
         trust: packages beside sdfhub whose classes may be built.
-        within: the package of sdfhub that the classes belong to.
+        within: the package of sdfhub that the other classes belong to.
 
     Raises:
         SdfhubError: a class of another package, an unknown or missing argument, a value of a wrong type.
@@ -99,11 +95,8 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
         return [built(item, key, trust, within) for item in node]
     if not isinstance(node, Mapping):
         return node
-    arguments = {
-        name: built(value, f"{key}.{name}", trust, within)
-        for name, value in node.items()
-        if name not in RESERVED
-    }
+    named = {name: value for name, value in node.items() if name not in RESERVED}
+    arguments = {name: built(value, f"{key}.{name}", trust, within) for name, value in named.items()}
     if "_target_" not in node:
         return arguments
     target = _trusted(node["_target_"], key, trusted_packages(trust), within)
@@ -140,19 +133,13 @@ def located(path: str, key: str) -> Callable:
     Raises:
         SdfhubError: there is none; says why it cannot be imported.
     """
-    parts, reason = str(path).split("."), "no such module"
-    for end in range(len(parts) - 1, 0, -1):
-        try:
-            target = importlib.import_module(".".join(parts[:end]))
-        except ImportError as error:
-            reason = str(error)
-            continue
-        for name in parts[end:]:
-            target = getattr(target, name, None)
+    try:
+        target = pkgutil.resolve_name(str(path))
         if callable(target):
             return target
-        reason = f"{'.'.join(parts[:end])} has none"
-        break
+        reason: object = f"it is a {type(target).__name__}"
+    except (ImportError, AttributeError, ValueError) as error:
+        reason = error
     raise SdfhubError(f"{key}: there is no class {path} ({reason}); is its package on the Python path?")
 
 

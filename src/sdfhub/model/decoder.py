@@ -30,7 +30,7 @@ def activated(
         dropout: probability in [0, 1) that a unit and its slope are 0; others are divided by 1 - dropout.
         sloped: whether the slope is wanted; else it is None.
     """
-    if not dropout and waves.fits(activation, product):
+    if not dropout and waves.fits(activation, product, shift):
         return waves.wave(activation, product, shift, sloped)
     x = product + shift
     value, slope = activation.with_slope(x) if sloped else (activation(x), None)

@@ -179,7 +179,13 @@ class Hash(Encoding):
     starts: Tensor
 
     def __init__(
-        self, levels: int, width: int, log2_table: int, coarsest: int, finest: int, include_points: bool = True
+        self,
+        levels: int,
+        width: int,
+        log2_table: int,
+        coarsest: int,
+        finest: int,
+        include_points: bool = True,
     ):
         super().__init__()
         if min(levels, width, coarsest) < 1 or finest < coarsest or not 1 <= log2_table <= 30:
