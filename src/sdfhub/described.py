@@ -5,6 +5,7 @@ as in a Hydra config; `_partial_` marks a factory. `describe` writes one, `built
 comes from a file: only classes of sdfhub and of packages that the caller trusts are imported for it.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -14,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 
@@ -48,7 +49,7 @@ def _remembering(initialise: Callable) -> Callable:
 
 
 def describe(value: Any, key: str = "") -> Any:
-    """Plain data, a class, a `functools.partial`, a dataclass or a `Described`, nested at will, as plain data.
+    """As plain data: such data, a class, a `functools.partial`, a dataclass or a `Described`, nested.
 
     Raises:
         SdfhubError: an object that cannot say how it was made; names `key`.
@@ -154,7 +155,11 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
     except (TypeError, ValueError):  # a class that is compiled
         return
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.values())
-    hints = _hints(target)
+    hints = {}
+    if target.__module__.partition(".")[0] not in ("lightning", "torch"):  # they check their own arguments
+        is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
+        with contextlib.suppress(Exception):  # an annotation that cannot be read at run time checks nothing
+            hints = typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
     for name, value in arguments.items():
         if name not in signature and not takes_any:
             known = ", ".join(signature) or "no arguments"
@@ -163,29 +168,16 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
             check(value, hints[name], f"{key}.{name}")
 
 
-def _hints(target: Callable) -> dict[str, Any]:
-    if target.__module__.partition(".")[0] in ("lightning", "torch"):
-        return {}  # they check their own arguments
-    is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
-    try:
-        return typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
-    except Exception:  # an annotation that cannot be read at run time checks nothing
-        return {}
-
-
 def check(value: Any, hint: Any, key: str) -> Any:
     """The value as its annotation wants it; an int where a float is due is one.
 
     Raises:
         SdfhubError: it is no such value.
     """
-    lenient = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+    config = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+    own = hasattr(hint, "__pydantic_validator__")  # a model of pydantic has a config of its own
     try:
-        adapter = TypeAdapter(hint, config=lenient)
-    except PydanticUserError:  # a model of pydantic has a config of its own
-        adapter = TypeAdapter(hint)
-    try:
-        return adapter.validate_python(value)
+        return TypeAdapter(hint, config=None if own else config).validate_python(value)
     except ValidationError as error:
         wanted = dict.fromkeys(problem["msg"].lower().removeprefix("input ") for problem in error.errors())
         raise SdfhubError(f"{key}={value!r}: {' or '.join(wanted)}") from error

@@ -104,9 +104,6 @@ class Siren(Activation):
     """sin(omega x), with one omega for the first layer and one for the others.
 
     Source: Sitzmann et al. 2020, section 3.2: first layer U(-1/n, 1/n), others U(+-sqrt(6/n) / omega).
-
-    Args:
-        omega_0, omega_hidden: frequency factor of the first and of every other layer, > 0.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
@@ -139,7 +136,7 @@ class Hosc(Siren):
     Args:
         omega_0, omega_hidden: as in `Siren`.
         beta: initial sharpness, > 0; near 0 a scaled sine, large a square wave.
-        learn_beta: whether beta is trained with the decoder's weights.
+        learn_beta: whether beta is trained.
     """
 
     def __init__(
@@ -170,14 +167,10 @@ class Finer(Siren):
     """sin(omega (|x| + 1) x): a sine whose frequency grows away from zero, so that biases choose frequencies.
 
     Initialised as SIREN is, but for the first layer's biases, which are spread over U(-k, k). The authors'
-    code holds |x| + 1 fixed while it differentiates; here it is differentiated, because a normal is the
-    field's own slope.
+    code holds |x| + 1 fixed while it differentiates; here, where a normal is the field's slope, it is not.
+    Frequencies reach (2k + 1) omega.
 
     Source: Liu et al. 2024 (FINER), and its published code for the first biases.
-
-    Args:
-        omega_0, omega_hidden: as in `Siren`, at x = 0.
-        k: half-width of the first layer's initial biases, > 0; frequencies reach (2k + 1) omega.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, k: float, first: bool = False):
@@ -198,12 +191,9 @@ class Finer(Siren):
 
 
 class Gauss(Activation):
-    """exp(-x^2 / (2 a^2)).
+    """exp(-x^2 / (2 a^2)); a narrow bump gives features of higher rank and a steeper field.
 
     Source: Ramasinghe and Lucey 2022, who find that the law of the initial weights matters little for it.
-
-    Args:
-        a: width of the bump, > 0; a narrow one gives features of higher rank and a steeper field.
     """
 
     def __init__(self, a: float, first: bool = False):
@@ -226,10 +216,6 @@ class Wire(Siren):
     linear map, as here; the real layer in the authors' code has two.
 
     Source: Saragadam et al. 2023 (WIRE), and its published code.
-
-    Args:
-        omega_0, omega_hidden: frequency of the wave in the first and in every other layer, > 0.
-        s: inverse width of the bump, > 0.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, s: float, first: bool = False):

@@ -36,11 +36,11 @@ class AutoDecoder(L.LightningModule):
         shapes: S, rows of the code table, >= 1; `SdfDataModule.rows` tells how many there are.
         codes: makes the table, called with `shapes` and `size`.
         loss: the objective and its weights.
-        optim: makes the optimiser and its schedule; also a partial of an optimiser (`Optimisation.of`).
+        optim: an `Optimisation`, or a partial of an optimiser (`Optimisation.of`).
         computing: how steps are computed; by default as the device likes it.
         validation: scores a shape of `val_dataloader`; None validates nothing.
-        seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
-            run repeats an uninterrupted one.
+        seed: a step's randomness derives from it and the step's number, so that a resumed run repeats an
+            uninterrupted one.
     """
 
     def __init__(
@@ -59,16 +59,20 @@ class AutoDecoder(L.LightningModule):
         self.loss, self.optim = loss or SdfLoss(), Optimisation.of(optim or Optimisation())
         self.computing, self.validation, self.seed = computing or Computing(), validation, seed
         parts = {"decoder": decoder, "codes": codes, "loss": self.loss, "optim": self.optim}
-        parts |= {"computing": self.computing, "validation": validation}
-        plain = {name: describe(part, name) for name, part in parts.items()}
-        self.save_hyperparameters({**plain, "shapes": shapes, "seed": seed}, logger=False)
+        parts |= {"computing": self.computing, "validation": validation, "shapes": shapes, "seed": seed}
+        self.save_hyperparameters({name: describe(part, name) for name, part in parts.items()}, logger=False)
         self.steps = math.inf
         self._value, self._value_and_gradient = decoder.forward, decoder.value_and_gradient
         self._step_started = time.perf_counter()
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: Any = "cpu", trust: str | Sequence[str] = (), **_: Any
+        cls,
+        checkpoint_path: Any,
+        map_location: Any = "cpu",
+        *_: Any,
+        trust: str | Sequence[str] = (),
+        **__: Any,
     ) -> Self:
         """The model of a checkpoint with its weights. Runs no code of the file.
 
@@ -115,12 +119,7 @@ class AutoDecoder(L.LightningModule):
         return loss
 
     def objective(self, batch: Batch, progress: float) -> tuple[Tensor, Parts]:
-        """The loss of a batch, which a step lowers, and its weighted parts, whose sum it is.
-
-        Args:
-            batch: of training shapes.
-            progress: share of training done, in [0, 1].
-        """
+        """The loss of a batch at a share of training in [0, 1], and its weighted parts, whose sum it is."""
         device = batch.sdf.device
         limit, threads = self.computing.together(device, batch.sdf.numel()), self.computing.threads(device)
         learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -137,12 +136,11 @@ class AutoDecoder(L.LightningModule):
 
     def validation_step(self, shape: Any, batch_idx: int) -> None:
         """Scores one shape of `val_dataloader`: `val/...` of held-out shapes, `train/...` of known ones."""
-        if self.validation is None:
-            return
-        scores = self.validation(self.decoder, shape, self.codes.table)
-        role = "val" if shape.role == "held_out" else "train"
-        named = {f"{role}/{name}": value for name, value in scores.items()}
-        self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
+        if self.validation:
+            scores = self.validation(self.decoder, shape, self.codes.table)
+            role = "val" if shape.role == "held_out" else "train"
+            named = {f"{role}/{name}": value for name, value in scores.items()}
+            self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
 
     @property
     def progress(self) -> float:
@@ -186,13 +184,13 @@ class AutoDecoder(L.LightningModule):
         )
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
-        values = {f"loss/{name}": part.detach() for name, part in parts.items()}
-        values["codes/norm"] = self.codes.table[batch.rows].detach().norm(dim=-1).mean()
+        values = {f"loss/{name}": float(part.detach()) for name, part in parts.items()}
+        values["codes/norm"] = float(self.codes.table[batch.rows].detach().norm(dim=-1).mean())
         for index, activation in enumerate(self.decoder.activations):
             values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
         shared = self.trainer.world_size > 1  # processes then log the mean over their shares of the batch
         self.log("loss/total", loss.detach(), prog_bar=True, sync_dist=shared)
-        self.log_dict({name: float(value) for name, value in values.items()}, sync_dist=shared)
+        self.log_dict(values, sync_dist=shared)
 
     def on_train_batch_end(self, outputs, batch: Batch, batch_idx: int) -> None:
         seconds = time.perf_counter() - self._step_started

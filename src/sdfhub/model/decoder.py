@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -89,12 +90,12 @@ class Decoder(Described, nn.Module):
         self.encoding, self.code_size = as_encoding(encoding), code_size
         self.dropout, self.tanh = dropout, tanh
         activations = [new_activation(activation, index == 0) for index in range(depth)]
-        joins_code = getattr(conditioning, "func", conditioning).joins_code
+        kind: Any = conditioning.func if isinstance(conditioning, partial) else conditioning
         layers: list[Layer] = []
         hidden, features = 0, self.encoding.features
         for index in range(depth + 1):
             after = features * (index + 1 in inject_encoding)
-            after += code_size * (index + 1 in inject_code) * joins_code
+            after += code_size * (index + 1 in inject_code) * kind.joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(
@@ -136,7 +137,8 @@ class Decoder(Described, nn.Module):
         """Signed distances [B, N] and each hidden layer's slopes [B, N, W], where wanted, else None."""
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
-            inputs, slope = activated(activation, *layer(inputs, codes), dropout, sloped)
+            product, shift = layer(inputs, codes)
+            inputs, slope = activated(activation, product, shift, dropout, sloped)
             if following.columns[1]:
                 inputs = torch.cat([inputs, encoded.to(inputs.dtype)], dim=-1)
             slopes.append(slope)
@@ -163,7 +165,7 @@ class Decoder(Described, nn.Module):
         for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
             by_hidden, part = layer.pullback(cotangent, codes)
             by_encoding = by_encoding if part is None else by_encoding + part
-            if by_hidden is not None:
+            if by_hidden is not None and slope is not None:
                 cotangent = by_hidden * slope
         with full_precision(points):
             return sdf, to_space(by_encoding)

@@ -16,15 +16,11 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 def clamped_l1(predicted: Tensor, target: Tensor, delta: float) -> Tensor:
-    """Mean of |clamp(f, delta) - clamp(d, delta)|: a scalar.
+    """Mean of |clamp(f, delta) - clamp(d, delta)| of field values and signed distances, [B, N]: a scalar.
 
-    Source: the paper's L1 loss (Park et al. 2019, equation 4). A prediction outside [-delta, delta] whose
-    target lies outside on the same side costs nothing and gets no gradient.
+    A prediction outside [-delta, delta] whose target lies outside on the same side gets no gradient.
 
-    Args:
-        predicted: [B, N] field values.
-        target: [B, N] signed distances, normalised frame.
-        delta: half-width of the band in which distances count, > 0.
+    Source: the paper's L1 loss (Park et al. 2019, equation 4).
     """
     return (predicted.clamp(-delta, delta) - target.clamp(-delta, delta)).abs().mean()
 
@@ -45,8 +41,7 @@ class Loss(Described):
     """What a training lowers.
 
     Attributes:
-        delta: half-width of the band in which distances count, > 0, for what reads it beside the training:
-            the fit of unseen shapes and their error.
+        delta: half-width of the band in which distances count, > 0, also in fits of unseen shapes.
     """
 
     delta: float = 0.1
@@ -70,8 +65,8 @@ class Loss(Described):
     ) -> dict[str, Tensor]:
         """Weighted terms by name; their sum is the loss.
 
-        A large batch is worked on in pieces, so a term must be a mean: over samples or shapes, or, for a
-        term named `normal`, over surface points.
+        A large batch is worked on in pieces, so a term is a mean: over surface points for one named
+        `normal`, else over samples or shapes.
 
         Args:
             predicted: [B, N] field values.
@@ -94,9 +89,9 @@ class SdfLoss(Loss):
         delta: clamp of signed distances, normalised frame, > 0.
         lambda_code: weight of the code prior, >= 0.
         code_norm: `squared` for |z|^2 or `l2` for |z|.
-        warmup: share of training in [0, 1] over which lambda_code grows linearly from 0.
+        warmup: share of training over which lambda_code grows linearly from 0.
         tau: weight of the normal term, >= 0; 0 switches it off.
-        tau_start: share of training in [0, 1) before which tau is 0: normals cost time before they pay.
+        tau_start: share of training before which tau is 0: normals cost time before they pay.
     """
 
     delta: PositiveFloat = 0.1

@@ -37,11 +37,10 @@ class Computing:
             memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
             None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
-        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result but for
-            rounding: it adds up a table's gradient in any order. None: on a GPU, where it is installed and
-            agrees, and no deterministic algorithms are asked for.
+        tinycudann: whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order.
+            None: on a GPU, where it is installed and agrees, unless deterministic algorithms are asked for.
         matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
-            (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
+            (TF32) on a GPU, else `highest`.
     """
 
     points_at_once: PositiveInt | None = None
@@ -75,8 +74,8 @@ class Computing:
         twin = fused(encoding) if wanted and can_fuse(encoding, device) else encoding
         if self.tinycudann and twin is encoding:
             raise SdfhubError(
-                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
-                "tiny-cuda-nn built for it; null takes it where it is there"
+                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, "
+                "and tiny-cuda-nn built for it; null takes it where it is there"
             )
         return twin
 
@@ -87,26 +86,18 @@ class Computing:
         """
         if not (can_compile(device) if self.compile is None else self.compile):
             return functions
+        import torch._dynamo.config as dynamo  # here: it imports the compiler
+
         torch.compiler.reset()
-        fast = tuple(torch.compile(function) for function in functions)
-        return fast if self.compile else tuple(map(plain_if_broken, fast))
+        # unless it was asked for, what does not compile runs as it is; the backward pass has to be compiled
+        # with the forward one for that
+        dynamo.suppress_errors = aot.force_non_lazy_backward_lowering = self.compile is None
+        return tuple(torch.compile(function) for function in functions)
 
 
 def can_compile(device: torch.device) -> bool:
     """Whether it is a GPU, and what `torch.compile` needs for it beside PyTorch is there."""
     return device.type == "cuda" and bool(shutil.which(os.environ.get("CC", "cc")) and find_spec("triton"))
-
-
-def plain_if_broken(fast: Callable) -> Callable:
-    """A compiled function that PyTorch runs as it is, with a warning, where it does not compile."""
-    import torch._dynamo.config as dynamo  # here: it imports the compiler
-
-    def call(*arguments):
-        # the backward pass is compiled with the forward one: later, nobody could go on without it
-        with aot.patch(force_non_lazy_backward_lowering=True), dynamo.patch(suppress_errors=True):
-            return fast(*arguments)
-
-    return call
 
 
 def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
@@ -124,13 +115,10 @@ def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
 
 
 def keep_freed_memory() -> None:
-    """Lets this process keep blocks it has freed, up to a GiB and for all threads, where the C library is glibc.
+    """Lets this process keep up to a GiB of what it has freed, for all its threads, where there is glibc.
 
     Else the layers' outputs go back to the system and are fetched again, zeroed, at every step.
     """
-    try:
-        set_option = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # another C library
-        return
-    for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
-        set_option(option, value)
+    if set_option := getattr(ctypes.CDLL(None) if os.name == "posix" else None, "mallopt", None):
+        for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
+            set_option(option, value)
