@@ -85,9 +85,9 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
 
     Args:
         node: plain data; mappings with `_target_` become objects, wherever they stand.
-        key: what the description is of, for messages.
+        key: what it is, for messages.
         trust: packages beside sdfhub whose classes may be built.
-        within: the package of sdfhub that the other classes belong to.
+        within: the package of sdfhub that the others belong to.
 
     Raises:
         SdfhubError: a class of another package, an unknown or missing argument, a value of a wrong type.

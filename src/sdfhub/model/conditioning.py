@@ -29,8 +29,7 @@ class Layer(Described, nn.Module, ABC):
     """A linear layer over [hidden | encoding], steered by a code; it holds the weights of `linear`.
 
     Args:
-        hidden, encoding: number of input columns of each part; 0 leaves the part out.
-        code: L, numbers in the code; 0 leaves the layer unconditioned.
+        hidden, encoding, code: columns H, F and L of each part; 0 leaves the part out.
         outputs: W, number of output features.
 
     Attributes:
@@ -47,11 +46,9 @@ class Layer(Described, nn.Module, ABC):
 
     @abstractmethod
     def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Product [B, N, W], linear in the inputs [B, N, H + F], and the shift [B, 1, W] or [W] added to it.
+        """Product [B, N, W], linear in the inputs [B, N, H + F], and the shift by codes [B, L] added to it.
 
-        Args:
-            inputs: hidden features and encoded points.
-            codes: [B, L].
+        The shift is [B, 1, W] or [W].
         """
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
@@ -91,8 +88,7 @@ class Concat(Layer):
 class Film(Concat):
     """The code scales and shifts a layer's output: (1 + s(z)) (W x + b) + t(z).
 
-    s and t are one linear map of the code, a layer's own; pi-GAN has a mapping network before it, which a
-    table of free codes needs less than a generator's noise does.
+    s and t are one linear map of the code, a layer's own, without pi-GAN's mapping network before it.
 
     Source: Perez et al. 2018 (FiLM); Chan et al. 2021 (pi-GAN) for sines.
     """

@@ -111,10 +111,6 @@ class Fourier(Waves):
     """sin(2^k pi x) and cos(2^k pi x) for k = 0 ... frequencies - 1, per axis: F = 6 frequencies (+ 3).
 
     Source: Mildenhall et al. 2020, equation 4; the paper's "FFT".
-
-    Args:
-        frequencies: number of octaves, >= 1.
-        include_points: whether the coordinates themselves come first among the features.
     """
 
     octaves: Tensor
@@ -135,11 +131,9 @@ class Fourier(Waves):
 class Gaussian(Waves):
     """sin(2 pi B x) and cos(2 pi B x) with rows of B drawn once from N(0, sigma^2): F = 2 rows.
 
-    Source: Tancik et al. 2020, section 5. B is a buffer: it is saved with the weights.
+    sigma is in cycles per unit of the normalised frame. B is a buffer: it is saved with the weights.
 
-    Args:
-        rows: number of random directions, >= 1.
-        sigma: standard deviation of their entries, in cycles per unit of the normalised frame, > 0.
+    Source: Tancik et al. 2020, section 5.
     """
 
     directions: Tensor
@@ -171,8 +165,7 @@ class Hash(Encoding):
         log2_table: base-2 logarithm of the rows of a level's table.
         coarsest: cells along an axis of the first grid, over [-1, 1].
         finest: cells along an axis of the last grid; geometric in between.
-        include_points: whether the coordinates come first among the features (a table alone gives no slope
-            between shapes).
+        include_points: whether x comes first among the features; tables alone start with no slope.
     """
 
     cells: Tensor

@@ -63,10 +63,10 @@ class Optimisation:
 
     @classmethod
     def of(cls, make: Any) -> "Optimisation":
-        """The optimisation itself, or that of a partial of this class or of an optimiser.
+        """An optimisation itself, or that of a partial of this class or of an optimiser.
 
-        An optimiser's partial, such as `partial(torch.optim.AdamW, lr_decoder=1e-3, weight_decay=0.01)`, may
-        have keywords of this class too; its `lr` stands for a rate that is not given.
+        An optimiser's, such as `partial(torch.optim.AdamW, lr_decoder=1e-3, weight_decay=0.01)`, may have
+        keywords of this class too; its `lr` stands for a rate that is not given.
         """
         if hasattr(make, "configure"):
             return make

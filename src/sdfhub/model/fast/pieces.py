@@ -20,9 +20,7 @@ Parts = dict[str, Tensor]
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
     """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals.
 
-    Args:
-        batch: [B, N] samples, [B, M] surface points.
-        points: whole shapes together where several fit, else parts of one shape, >= 1.
+    They are of several whole shapes where those fit, else parts of one shape.
     """
     shapes, samples = batch.sdf.shape
     surface = max(1, batch.surface_points.shape[1])
@@ -43,17 +41,18 @@ def loss_in_pieces(
     parameters: Sequence[nn.Parameter],
     threads: int = 1,
 ) -> tuple[Tensor, Parts]:
-    """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
+    """The loss of a batch and its parts; the plain twin is `parts_of(batch)`.
 
     A batch of more than `points` samples is differentiated in here, piece by piece; `backward` only has to
-    hand the sum over. The plain twin is `parts_of(batch)`.
+    hand the sum over.
 
     Args:
-        parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.
+        parts_of: the weighted parts of a batch: means over surface points for one named `normal`, else over
+            samples or shapes. Called from all threads.
         batch: to be split.
         points: samples that are worked on together, >= 1.
         parameters: what the loss is differentiated by.
-        threads: each differentiates pieces of its own, >= 1; `parts_of` is called from all of them.
+        threads: each differentiates pieces of its own, >= 1.
     """
     if batch.sdf.numel() <= points:
         parts = parts_of(batch)
@@ -65,9 +64,8 @@ def loss_in_pieces(
         return {name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()}
 
     cut = list(pieces(batch, points))
-    seeds = [None] * len(cut)
-    if batch.sdf.is_cpu:  # drawn here, in order: threads take turns as they like
-        seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()
+    # drawn here, in order: threads take turns as they like
+    seeds = torch.randint(2**63 - 1, (len(cut),)).tolist() if batch.sdf.is_cpu else [None] * len(cut)
     calls = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
     shares = [share for thread in range(threads) if (share := calls[thread::threads])]
     totals: Parts = {}
