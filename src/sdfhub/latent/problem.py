@@ -100,10 +100,10 @@ class Problem:
             self.turns = turns(poses.turns, poses.up).to(like)
             narrow = torch.nn.functional.pad(poses.spread().to(like).pow(-2), (self.size, 0)).diag()
             around = (0, SIZE, 0, SIZE)
-            precisions = [torch.nn.functional.pad(each, around) + narrow for each in precisions]
-        weights = torch.tensor([prior.weight / self.size for prior in priors]).to(like)
+            precisions = [torch.nn.functional.pad(part, around) + narrow for part in precisions]
+        weighted = [prior.weight / self.size * part for prior, part in zip(priors, precisions, strict=True)]
         self.center = torch.stack([self.unknowns(prior.codes.mean) for prior in priors])  # [P, U]
-        self.precision = torch.stack(precisions) * weights[:, None, None]  # [P, U, U]
+        self.precision = torch.stack(weighted)  # [P, U, U]
 
     def unknowns(self, codes: Tensor) -> Tensor:
         """Unknowns [..., U] of codes [..., L] in the frame as it is."""
