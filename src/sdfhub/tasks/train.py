@@ -126,7 +126,6 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
     trainer = make_trainer(config.trainer, folder, callbacks, loggers)
-    model["computing"].refuse_impossible(model["decoder"].encoding, trainer.strategy.root_device)
     return Parts(
         data=instantiate(config.data, "data"),
         model=partial(AutoDecoder, **model, seed=config.seed),
