@@ -156,7 +156,7 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
         return
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.values())
     hints = {}
-    if target.__module__.partition(".")[0] not in ("lightning", "torch"):  # they check their own arguments
+    if target.__module__.partition(".")[0] != "torch":  # checks its own arguments, and annotates some wrongly
         is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
         with contextlib.suppress(Exception):  # an annotation that cannot be read at run time checks nothing
             hints = typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
