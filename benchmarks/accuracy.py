@@ -5,8 +5,8 @@
 Trains experiment=fft_hosc at scale=demo (8 chairs, 1600 steps) with equal seeds, data and steps: by
 plain_training.py, by train.py in float32 and with trainer.precision=bf16-mixed; all are judged in float32.
 Prints the training shapes' CD times 10^3 and its excess over the floor, and what the mean CD is to that of
-the plain training; seeds differ in weights and order of samples, so their spread is the noise that a ratio has to
-be read against. One floating crumb, which rounding decides about, makes a mean and leaves the median.
+the plain training; seeds differ in weights and order of samples, so their spread is the noise that a ratio
+has to be read against. One floating crumb, decided by rounding, makes a mean and leaves the median.
 """
 
 import argparse

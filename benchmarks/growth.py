@@ -90,7 +90,7 @@ def trained(shapes: int, steps: int) -> Growth:
         *("category=tables", f"data.shapes={shapes}", "data.held_out=0", f"data.store={FOLDER / 'store'}"),
         *(f"data.loader.shapes_per_step={PER_STEP}", f"data.loader.samples_per_shape={SAMPLES}"),
         *(f"data.loader.surface_per_shape={SURFACE}", "callbacks=none", "evaluate.train=0"),
-        "trainer.limit_val_batches=0",
+        "++trainer.limit_val_batches=0",
         *("trainer=cpu", "trainer.max_epochs=1", "trainer.log_every_n_steps=1"),
         *(f"data.loader.passes_per_epoch={steps * PER_STEP // shapes}", f"hydra.run.dir={run}"),
     ]

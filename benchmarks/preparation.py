@@ -15,6 +15,7 @@ clean twin.
 
 import argparse
 import os
+import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator

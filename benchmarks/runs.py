@@ -23,7 +23,7 @@ def train(name: str, *overrides: str, script: str = "train.py") -> dict:
         script: that trains, relative to the repository's root.
     """
     folder = OUTPUTS / name
-    words = [f"hydra.run.dir={folder}", "trainer.enable_progress_bar=false", "trainer.limit_val_batches=0"]
+    words = [f"hydra.run.dir={folder}", "trainer.enable_progress_bar=false", "++trainer.limit_val_batches=0"]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with locked(folder.parent / f"{name}.lock"):
         shutil.rmtree(folder, ignore_errors=True)  # what an earlier state of the code left is no answer
