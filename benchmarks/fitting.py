@@ -40,7 +40,7 @@ def unseen_shapes(run: Path, count: int) -> list[StoredShape]:
     config, roles = read_run(run)
     data = data_of(config)
     others = [shape for shape in data.source.shapes() if shape.id not in roles["train"]]
-    return list(data.filled(split(others, 0, count, seed=1)))
+    return list(data.filled(split(others, 0, count, seed=1)).values())
 
 
 def timed(

@@ -67,7 +67,7 @@ def filled_store(real: int) -> Store:
     """The store of as many tables as the largest count, `real` of them prepared, the others copied."""
     source, preparation = ProceduralSource({"tables": {}}, count=COUNTS[-1]), Preparation()
     shapes = split(source.shapes(), train=None, held_out=0, seed=0).train
-    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store"))
+    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store").values())
     folder = FOLDER / "store" / source.name / store.preparation_hash(preparation)
     for index, shape in enumerate(shapes[real:]):
         path = folder / f"{shape.id}{stored_shape.SUFFIX}"
@@ -133,7 +133,7 @@ def draw_times(shapes: Store, *sizes: int) -> tuple[float, float]:
         sizes: shapes a step, samples and surface points of each.
     """
     keep_freed_memory()  # as training does
-    batches = StepBatches(list(shapes), Loading(*sizes))
+    batches = StepBatches(list(shapes.values()), Loading(*sizes))
     seconds = []
     for step in range(2 * len(batches)):
         start = time.perf_counter()
@@ -176,7 +176,7 @@ def report(shapes: Store, arguments: argparse.Namespace) -> None:
         alone.append(imports())
         for count in COUNTS:
             found[count].append(trained(count, arguments.steps))
-    size = sum(shape.path.stat().st_size for shape in shapes)
+    size = sum(shape.path.stat().st_size for shape in shapes.values())
     print(f"Store: {len(shapes)} shapes, {size / 1e9:.1f} GB; {arguments.real} prepared, the others copies.")
     head("shapes | start-up s | of the processor | samples/s | memory GB | codes MB | checkpoint MB")
     for count, runs in found.items():

@@ -59,7 +59,7 @@ def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -
         out: folder of the results.
     """
     vertices, faces = mesh
-    write_mesh(vertices / shape.scale + shape.center, faces, out / "meshes" / role / f"{shape.id}.ply")
+    write_mesh(shape.frame.to_source(vertices), faces, out / "meshes" / role / f"{shape.id}.ply")
 
 
 def pictured(shape: StoredShape, mesh: Mesh) -> tuple[np.ndarray, np.ndarray | str]:

@@ -88,7 +88,7 @@ def _observe_mesh(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.rand
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
     prepared = prepare_mesh((scan.points, scan.faces), preparation)
     points, sdf = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64)
-    own = Frame(prepared.center, prepared.scale)
+    own = prepared.frame
     if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
         seen = observe(Scan(own.to_source(points), sdf=sdf / own.scale), evidence, frame, rng)
     else:

@@ -162,7 +162,7 @@ def _archive(path: Path) -> Scan:
     if {"pos", "neg"} <= names:
         samples = read_samples(path)
         points, sdf = samples.points.astype(np.float64), samples.sdf.astype(np.float64)
-        return Scan(points, sdf=sdf, frame=Frame(samples.center, samples.scale))
+        return Scan(points, sdf=sdf, frame=samples.frame)
     if "points" not in names:
         what = ", ".join(sorted(names)) or "nothing"
         raise SdfhubError(f"{path}: holds {what}; expected pos and neg, points and sdf, or points")
