@@ -15,7 +15,7 @@ class Preparation:
     those of its paper; `min_*` and `max_*` are the limits beyond which `prepare_mesh` raises `RejectedMesh`.
     """
 
-    # a method's name (winding takes pseudo_normal on clean closed meshes), or a `signs.SignMethod` of one's own
+    # a method's name (winding takes pseudo_normal on clean closed meshes), or one's own `signs.SignMethod`
     sign: Literal["winding", "vote", "pseudo_normal"] | Callable = "winding"
     samples: PositiveInt = 500_000  # of a shape, signed
     near_share: Annotated[float, Field(ge=0, le=1)] = 0.94  # near the surface; the rest in [-1, 1]^3

@@ -28,9 +28,9 @@ from tqdm import tqdm
 from sdfhub.data.preparation.sampling import prepare_mesh
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
-from sdfhub.described import describe
 from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_of, write_shape
 from sdfhub.data.workers import Crashed, map_in_processes
+from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
 from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
