@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,8 @@ FORMATS = ("ply", "obj", "glb")
 """Formats of written meshes."""
 
 FAR = 16
-"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it: scans
-in geographic coordinates lie far beyond. GLB has no other coordinates; OBJ is text."""
+"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as in
+geographic coordinates. GLB has no other coordinates; OBJ is text."""
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
@@ -45,9 +46,8 @@ def _ply(vertices: np.ndarray, faces: np.ndarray) -> bytes:
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
     rows["count"], rows["corners"] = 3, faces
-    return (
-        "\n".join(head).encode() + np.asarray(vertices, "<f8" if is_far else "<f4").tobytes() + rows.tobytes()
-    )
+    coordinates = np.asarray(vertices, "<f8" if is_far else "<f4")
+    return "\n".join(head).encode() + coordinates.tobytes() + rows.tobytes()
 
 
 def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
@@ -69,6 +69,5 @@ def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
         _export(scene, path)
 
 
-def _export(content, path: Path) -> None:
-    exported = content.export(file_type=path.suffix[1:])
-    write_whole(path, exported.encode() if isinstance(exported, str) else exported)
+def _export(content: Any, path: Path) -> None:
+    write_whole(path, content.export(file_type=path.suffix[1:]))
