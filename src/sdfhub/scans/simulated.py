@@ -11,6 +11,7 @@ from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
@@ -62,12 +63,12 @@ class ScanKind:
         return f"{self.kind}{count}" + (f", noise {self.noise:g}" if self.noise else "")
 
     def observations(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[ObservedScan]:
-        """Simulated scans of shapes, observed: one of each shape, several views."""
+        """Simulated scans of shapes, observed in the normalised frame: one of each shape, several views."""
         numbers = range(VIEWS if self.kind == "view" else 1)
         return [self.observe(shape, evidence, number) for shape in shapes for number in numbers]
 
     def observe(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> ObservedScan:
-        """A simulated scan of a shape, in the normalised frame, observed; another number gives another."""
+        """A simulated scan of a shape, observed; another number gives another one."""
         rng = np.random.default_rng([shape_seed(shape), number])
         return observe(self.scan(shape, number), evidence, NORMALIZED, rng)
 
@@ -94,7 +95,7 @@ class ScanKind:
         return Scan(points, normals if self.kind == "oriented" else None)
 
 
-def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
+def random_sensor(rng: np.random.Generator, up: UpAxis) -> np.ndarray:
     """[3] a place around the unit ball, not far above or below its middle."""
     height, turn = rng.uniform(-HEIGHT, HEIGHT), rng.uniform(0, 2 * np.pi)
     flat = np.sqrt(1 - height**2)
@@ -105,12 +106,12 @@ def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
 def surface_scan(
     mesh: NormalizedMesh, count: int, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [count, 3] spread evenly over a mesh, moved by normal noise, and their faces' normals.
+    """Points [count, 3] spread evenly over a mesh, and their faces' normals.
 
     Args:
         mesh: its faces turned outwards.
         count: points.
-        noise: standard deviation along each axis, normalised frame.
+        noise: standard deviation along each axis, normalised frame, of what the points are moved by.
         rng: of the points.
     """
     points, normals = sample_surface(mesh.vertices, mesh.faces, count, rng)
