@@ -1,17 +1,18 @@
 """What a search for settings asks of its trainings, and how many of them are left."""
 
 import os
+from math import inf
 from statistics import geometric_mean, mean, median
 from typing import Any
 
 from sdfhub.report.results import NOISE, ROLES, ShapeScore
 
 
-def objective(metrics: dict[str, Any]) -> float | None:
+def objective(metrics: dict[str, Any]) -> float:
     """What a search lowers: the geometric mean of mean and median excess CD of both roles.
 
     A factor counts alike in each of the four; a median alone would not see one broken shape of eight. Sources
-    without meshes are judged by the error of distances. None where nothing was judged, as after a failure.
+    without meshes are judged by the error of distances. Infinite after a failure, where nothing was judged.
 
     Args:
         metrics: what `metrics.json` of a run holds.
@@ -22,7 +23,7 @@ def objective(metrics: dict[str, Any]) -> float | None:
         for rows in judged
     ]
     printed = [statistic(values) for values in errors for statistic in (mean, median)]
-    return geometric_mean(max(value, NOISE) for value in printed) if printed else None
+    return geometric_mean(max(value, NOISE) for value in printed) if printed else inf
 
 
 def trials_left(total: int, storage: str, study: str) -> int:

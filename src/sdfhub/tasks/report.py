@@ -20,7 +20,6 @@ from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import latex, markdown, origin, overview, tables
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable, write_whole
 
 log = logging.getLogger(__name__)
@@ -113,8 +112,3 @@ def report(config: DictConfig) -> None:
     cells = write_report(sweep, folder, config.shapes)
     if failed := sum(cell.state == "failed" for cell in cells):
         log.warning("%d of %d cells failed; the command of the sweep tries them again", failed, len(cells))
-
-
-def main() -> None:
-    """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    run_task(report, "report", ["sweep"])

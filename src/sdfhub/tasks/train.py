@@ -5,7 +5,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import hydra
 import torch
@@ -35,7 +35,6 @@ from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
@@ -69,7 +68,7 @@ class Parts:
     evaluation: Evaluation
 
 
-def train(config: DictConfig, folder: Path) -> dict[str, Any]:
+def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Trains what a composed config describes into a folder.
 
     Returns:
@@ -100,7 +99,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
     fit(model, parts, config.ckpt_path)
     if not parts.trainer.is_global_zero:
         return {}
-    if parts.trainer.fast_dev_run:
+    if getattr(parts.trainer, "fast_dev_run", False):
         log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
         return {}
     checkpoint = folder / "checkpoints" / LAST
@@ -147,15 +146,16 @@ def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
     parts = []
     for name, node in (config or {}).items():
         if node is not None:
-            parts.append(instantiate(node, f"{group}.{name}"))
+            parts.append(instantiate(node, f"{group}.{name!s}"))
             if not isinstance(parts[-1], kind):
-                raise SdfhubError(f"{group}.{name}: is no Lightning {kind.__name__}; give it a _target_")
+                raise SdfhubError(f"{group}.{name!s}: is no Lightning {kind.__name__}; give it a _target_")
     return parts
 
 
 def make_optimisation(config: DictConfig) -> Optimisation:
     """What `optim` describes; its `_target_` may be an optimiser of PyTorch, in the place of Adam."""
-    if issubclass(located(config._target_, "optim"), torch.optim.Optimizer):
+    target: Any = located(config._target_, "optim")
+    if issubclass(target, torch.optim.Optimizer):
         return Optimisation.of(hydra.utils.instantiate(config, _convert_="all", _partial_=True))
     return Optimisation.of(instantiate(config, "optim"))
 
@@ -176,18 +176,12 @@ def make_trainer(
         )
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
-    ours = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
-    ours |= {
-        "plugins": [WholeFileIO()],
-        "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks),
-    }
+    ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
+    ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
+    ours["plugins"] = [WholeFileIO()]
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     trainer = instantiate(config, "trainer", **given)
-    for name in (
-        "lightning",
-        "lightning.pytorch",
-        "lightning.fabric",
-    ):  # through our handlers, into train.log
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
     for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
@@ -247,17 +241,12 @@ def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]
         logger.save()
 
 
-def run(config: DictConfig) -> float | None:
+def train(config: DictConfig) -> float | None:
     """One run, or one cell of a multirun, of a composed config with Hydra's own part set."""
     hydra = HydraConfig.get()
     if config.print_config:
         log.info(OmegaConf.to_yaml(config))
     if hydra.mode == RunMode.MULTIRUN:
-        return objective(run_cell(train, config, hydra))
-    go_on(train, config, Path(hydra.runtime.output_dir))
+        return objective(run_cell(train_into, config, cast(DictConfig, hydra)))
+    go_on(train_into, config, Path(hydra.runtime.output_dir))
     return None
-
-
-def main() -> None:
-    """Console entry: `python train.py activation=hosc encoding=fourier`."""
-    run_task(run, "config")
