@@ -15,6 +15,7 @@ from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import STATISTICS, ShapeMetrics, summarize
 from sdfhub.geometry.render import render
+from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.whole_file import write_whole
 
@@ -75,7 +76,7 @@ def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -
     write_mesh(vertices / shape.scale + shape.center, faces, out / "meshes" / role / f"{shape.id}.ply")
 
 
-def pictured(truth: NormalizedMesh, mesh: Mesh, up: str) -> tuple[np.ndarray, np.ndarray | str]:
+def pictured(truth: NormalizedMesh, mesh: Mesh, up: UpAxis) -> tuple[np.ndarray, np.ndarray | str]:
     """Pictures of a shape and of its reconstruction, normalised frame."""
     reconstruction = render(*mesh, up=up) if len(mesh.faces) else "no surface"
     return render(truth.vertices, truth.faces, up=up), reconstruction
@@ -113,9 +114,8 @@ def write_scores(
         sheet = list(zip(*pictures, strict=True))
         path = contact_sheet(sheet, ["ground truth", "reconstruction"], captions, out / "contact_sheet.png")
         log.info("contact sheet: %s", path)
-    write_whole(
-        out / "metrics.json", json.dumps(result, indent=1, default=str)
-    )  # last: a run that has it is finished
+    # last: a run that has it is finished
+    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
     log.info("metrics:       %s", out / "metrics.json")
     return result
 

@@ -13,7 +13,7 @@ wherever a sign change leaves the blocks, the neighbour joins them, and when an 
 all are evaluated again. So a connected piece of surface is found whole or not at all.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -33,7 +33,7 @@ class SampledCells(NamedTuple):
     values: np.ndarray
     slope: np.ndarray
 
-    def where(self, mask: np.ndarray) -> "SampledCells":
+    def where(self, mask: Any) -> "SampledCells":
         return SampledCells(*(array[mask] for array in self))
 
     def candidates(self, stride: int) -> "SampledCells":
@@ -82,7 +82,8 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
     active = np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
-    samples, crossed = [(_centre_keys(grid, sampled.cells, 2), sampled.values)], [np.empty(0, grid.integers)]
+    samples = [(_centre_keys(grid, sampled.cells, 2), sampled.values)]
+    crossed: list[np.ndarray] = [np.empty(0, grid.integers)]
     states[samples[0][0]] = _evaluated_states(sampled.values)
     while len(blocks):
         active[tuple(blocks.T)] = True

@@ -58,7 +58,7 @@ class Grid:
         tiles_each = -(-counts // TILE)
         shift = TILE * (np.cumsum(tiles_each) - tiles_each) - first[:-1]
         place, owner = np.arange(len(keys)) + np.repeat(shift, counts), np.repeat(shapes[:-1], tiles_each)
-        tiles = np.zeros((len(owner), TILE), self.integers)
+        tiles: np.ndarray = np.zeros((len(owner), TILE), self.integers)
         tiles.reshape(-1)[place] = keys - np.repeat(self.n**3 * shapes[:-1], counts)
         values = np.empty(tiles.shape, np.float32)
         together = max(1, self.batch // TILE)

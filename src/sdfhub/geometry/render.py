@@ -124,7 +124,7 @@ def _light(scene: EmbreeScene, points, normals, flat, subpixel, rays: int) -> np
     """
     start = (points + 2e-3 * flat).astype(np.float32)
     around = _unit(_unit(_KEY) + 0.09 * sphere_directions(12))  # the key is an area light
-    key = sum(_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)) / 3
+    key = np.sum([_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)], axis=0) / 3
     fill = np.clip(normals @ _unit(_FILL), 0, None)
     sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
     warm, cool = np.array([1.0, 0.95, 0.87]), np.array([0.88, 0.95, 1.0])

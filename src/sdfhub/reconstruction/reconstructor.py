@@ -106,8 +106,9 @@ class Reconstructor:
         scans, results = list(group.values()), []
         fitted = self.fitted(scans)
         doubts = self.doubts(fitted).tolist()
-        is_free = self.poses is not None and fitted.poses is not None
-        near = self.poses.holds(fitted.poses).tolist() if is_free else [True] * len(group)
+        near = [True] * len(group)
+        if self.poses and fitted.poses:
+            near = self.poses.holds(fitted.poses).tolist()
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
             result = Result(

@@ -8,6 +8,8 @@ from typing import Literal
 
 from sdfhub.whole_file import write_whole
 
+Verdict = Literal["fitted", "doubtful", "unjudged", "failed"]
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -39,7 +41,7 @@ class Result:
     residual: float | None = None
     doubt: float | None = None
     limits: Limits | None = None
-    verdict: Literal["fitted", "doubtful", "unjudged", "failed"] = "failed"
+    verdict: Verdict = "failed"
     reason: str = ""
     code: tuple[float, ...] = ()
     frame: tuple[tuple[float, ...], ...] = ()
@@ -47,18 +49,17 @@ class Result:
 
     def judged(self, limits: Limits | None, is_near: bool) -> "Result":
         """The same with a verdict; `is_near` tells whether its pose lies within the range of poses."""
+        verdict: Verdict = "doubtful"
         if self.mesh is None:
-            verdict, reason = "doubtful", "the field has no surface"
+            reason = "the field has no surface"
         elif not is_near:
-            verdict, reason = "doubtful", "no pose within poses.scale, poses.tilt and poses.shift was found"
-        elif limits is None:
+            reason = "no pose within poses.scale, poses.tilt and poses.shift was found"
+        elif limits is None or self.residual is None or self.doubt is None:
             verdict, reason = "unjudged", "nothing was calibrated"
         else:
-            pairs = ("residual", self.residual, limits.residual), ("doubt", self.doubt, limits.doubt)
-            beyond = [
-                f"{name} {value / most:.2f} x its limit" for name, value, most in pairs if not value <= most
-            ]
-            verdict, reason = "doubtful" if beyond else "fitted", ", ".join(beyond)
+            shares = {"residual": self.residual / limits.residual, "doubt": self.doubt / limits.doubt}
+            reason = ", ".join(f"{name} {x:.2f} x its limit" for name, x in shares.items() if not x <= 1)
+            verdict = "doubtful" if reason else "fitted"
         return replace(self, limits=limits, verdict=verdict, reason=reason)
 
     def write(self, out: Path) -> None:
