@@ -40,7 +40,7 @@ def unseen_shapes(space: Path, count: int) -> list[StoredShape]:
     config, roles = read_run(space)
     data = build(config["data"] | {"workers": 1}, "data", within="sdfhub.data")
     others = [shape for shape in data.source.shapes() if shape.id not in roles["train"]]
-    return list(data.filled(split(others, 0, count, seed=1)))
+    return list(data.filled(split(others, 0, count, seed=1)).values())
 
 
 def evaluation(fit: str, together: int, seed: int) -> Evaluation:

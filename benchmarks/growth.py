@@ -68,7 +68,7 @@ def filled_store(real: int) -> Store:
     """The store of as many tables as the largest count, `real` of them prepared, the others copied."""
     source, preparation = ProceduralSource({"tables": {}}, count=COUNTS[-1]), Preparation()
     shapes = split(source.shapes(), train=None, held_out=0, seed=0).train
-    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store"))
+    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store").values())
     folder = FOLDER / "store" / source.name / store.preparation_hash(preparation)
     for index, shape in enumerate(shapes[real:]):
         path = folder / f"{shape.id}{stored_shape.SUFFIX}"

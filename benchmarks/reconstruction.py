@@ -67,7 +67,7 @@ def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
     source = ProceduralSource({"lamps": {}})
     preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
     shapes = split(source.shapes(), 0, count, seed=4).held_out
-    return list(prepare(source, shapes, preparation, trained["data"]["store"], workers=1))
+    return list(prepare(source, shapes, preparation, Path(trained["data"]["store"]), workers=1).values())
 
 
 def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:

@@ -467,5 +467,5 @@ def test_real_furniture_trains_to_a_table(tmp_path):
     assert len(metrics["train"]["shapes"]) >= 2
     config = yaml.safe_load((folder / "config.yaml").read_text())
     data = data_of(config)
-    assert all(shape.credits["licence"] for shape in data.filled(data.split))
+    assert all(shape.credits["licence"] for shape in data.filled(data.split).values())
     assert config["data"]["source"]["root"] == str(OPEN), "a run is judged from anywhere"

@@ -73,7 +73,7 @@ class Judged:
 def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -> None:
     """Writes a reconstruction in the normalised frame below `out`/meshes, in that of the source's meshes."""
     vertices, faces = mesh
-    write_mesh(vertices / shape.scale + shape.center, faces, out / "meshes" / role / f"{shape.id}.ply")
+    write_mesh(shape.frame.to_source(vertices), faces, out / "meshes" / role / f"{shape.id}.ply")
 
 
 def pictured(truth: NormalizedMesh, mesh: Mesh, up: UpAxis) -> tuple[np.ndarray, np.ndarray | str]:

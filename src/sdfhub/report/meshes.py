@@ -56,7 +56,7 @@ def reconstruction(
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
             return None
-        frame = Frame(truth.center, truth.scale) if truth else Frame.around(vertices)[0]
+        frame = truth.frame if truth else Frame.around(vertices)[0]
     except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
         return None
     return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")

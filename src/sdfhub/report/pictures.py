@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +10,7 @@ from functools import partial
 import numpy as np
 from PIL import Image
 
-from sdfhub.data.workers import stream_in_processes, workers_worth
+from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.render import render
 from sdfhub.report.meshes import FindTruth, ShownMesh, packed, reconstruction, true_mesh
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
@@ -64,7 +65,7 @@ class Gallery:
         for _ in range(2):
             sheets = [(self.sheet(group, count), self.extremes(group)) for group in groups]
             left = {key: mesh for key, mesh in self._wanted.items() if key not in self._images}
-            workers = workers_worth(len(left), A_WORKERS_WORTH)
+            workers = min(os.cpu_count() or 1, len(left) // A_WORKERS_WORTH)
             images = stream_in_processes(picture, list(left.values()), workers)
             self._images |= dict(zip(left, images, strict=True))
         return sheets

@@ -229,4 +229,4 @@ def known_frames(root: Path, name_of: Mapping[str, str]) -> dict[str, Frame]:
     """Frames of shapes, as far as DeepSDF's data lies at `root`."""
     samples = root if root.name == "SdfSamples" else root / "SdfSamples"
     frames = {id: frame_of(samples / f"{name}.npz") for id, name in name_of.items()}
-    return {id: Frame(*frame) for id, frame in frames.items() if frame}
+    return {id: frame for id, frame in frames.items() if frame}

@@ -114,7 +114,7 @@ def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape
     rest = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
     rest = [shape for shape in rest if shape.split == "held_out"] or rest
     more = split(rest, 0, min(count - len(first), len(rest)), seed=0).held_out
-    return list(data.filled(Split([], first + more)))
+    return list(data.filled(Split([], first + more)).values())
 
 
 def limits_of(

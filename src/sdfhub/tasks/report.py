@@ -85,7 +85,7 @@ def truth_finder() -> FindTruth:
         if key not in stores:
             stores[key] = _store(cell.scores.config)
         store = stores[key]
-        return store[id] if store and id in store else None
+        return store.get(id) if store else None
 
     return find
 
@@ -93,12 +93,10 @@ def truth_finder() -> FindTruth:
 def _store(config: dict[str, Any]) -> Store | None:
     try:
         data = data_of(config)
-        store = Store.open(Path(data.store) / data.source.name / preparation_hash(data.preparation))
+        folder = Path(data.store) / data.source.name / preparation_hash(data.preparation)
+        return Store.open(folder, up=data.source.up)
     except (SdfhubError, KeyError, TypeError, AttributeError):
         return None  # not on this machine: a report without ground truth
-    for shape in store:
-        shape.up = data.source.up
-    return store
 
 
 def report(config: DictConfig) -> None:

@@ -34,7 +34,6 @@ from sdfhub.multirun.processes import ending_together, refuse_processes_in_multi
 from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
-from sdfhub.shapes import Frame
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
@@ -91,7 +90,7 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
         written | {"data": with_absolute_paths(written["data"])},
         train=ids,
         held_out=[shape.id for shape in parts.data.held_out_shapes],
-        frames={shape.id: Frame(shape.center, shape.scale) for shape in parts.data.train_shapes},
+        frames={shape.id: shape.frame for shape in parts.data.train_shapes},
         up=parts.data.train_shapes[0].up,
     )
     log.info("run: %s", folder)
@@ -127,7 +126,6 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
     trainer = make_trainer(config.trainer, folder, callbacks, loggers)
-    model["computing"].refuse_impossible(model["decoder"].encoding, trainer.strategy.root_device)
     return Parts(
         data=instantiate(config.data, "data"),
         model=partial(AutoDecoder, **model, seed=config.seed),
@@ -184,8 +182,9 @@ def make_trainer(
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
-    for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
-        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
+    # what hardware there is not, advertisements, defaults of Lightning's own files
+    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     return trainer
 
 
