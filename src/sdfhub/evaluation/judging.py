@@ -30,9 +30,8 @@ from sdfhub.space import reconstruct
 
 log = logging.getLogger(__name__)
 
+# shapes to judge for which a worker process is started: it takes as long to start as to judge one or two
 WORTH_A_PROCESS = 4
-"""Shapes to judge for which a worker process is started: it takes as long to start as to judge one or two."""
-
 NOISE = 64
 """Faces, in squared resolutions, above which a mesh is noise: ten times those of the unit sphere. What a
 training that diverged leaves crosses zero in every cell: it is no surface, and would take gigabytes."""

@@ -48,10 +48,7 @@ class SampledCells(NamedTuple):
 def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
     """The blocks in cells that coarser levels could not skip, those of a shape together.
 
-    Args:
-        grid: of all shapes.
-        coarse: cells per axis at the coarsest level, about: strides are powers of two.
-        safety: factor on the measured slopes.
+    Strides are powers of two, with about `coarse` cells per axis first; `safety` multiplies measured slopes.
     """
     stride = 2 if grid.n <= _SMALL else 2 ** max(1, round(np.log2((grid.n - 1) / coarse)))
     m = _cells_per_axis(grid.n, stride)
@@ -69,11 +66,7 @@ def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
 
 
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The cells of stride 1 on which the sign changes, and the values at their nodes.
-
-    Args:
-        grid: of all shapes.
-        sampled: blocks; the candidates among them grow until no sign change leaves them.
+    """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
     Returns:
         keys [M] of the cells' lowest nodes; keys [K] of nodes, those of the cells among them, each once and

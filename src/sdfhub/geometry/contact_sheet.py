@@ -12,8 +12,7 @@ from sdfhub.whole_file import whole_file
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 _INK, _FAINT, _TILE = (40, 44, 52), (150, 154, 162), (243, 243, 245)
 
-GAP = 4
-"""White between pictures, pixels."""
+GAP = 4  # white between pictures, pixels
 
 
 def contact_sheet(

@@ -7,9 +7,7 @@ Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with T
 import numpy as np
 from skimage.measure import marching_cubes
 
-SLAB_NODES = 2**24
-"""Nodes marched at a time: 64 MiB of values, whatever the resolution."""
-
+SLAB_NODES = 2**24  # nodes marched at a time: 64 MiB of values, whatever the resolution
 EMPTY = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
 
 
@@ -21,13 +19,11 @@ def march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def march_cells(
     cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes over some cells, one slab of x at a time, joined to one mesh.
+    """Marching cubes over cells on which the sign changes, one slab of x at a time, joined to one mesh.
 
     Args:
-        cells: [M] flat indices of the lowest nodes of cells on which the sign changes, x slowest.
-        nodes: [K] flat indices of nodes; all corners of the cells are among them.
-        values: [K] float32 at the nodes.
-        n: nodes per axis.
+        cells: [M] flat indices of their lowest nodes in a grid of n nodes per axis, x slowest.
+        nodes, values: [K] flat indices of nodes, all corners of the cells among them, and float32 there.
     """
     if not len(cells):
         return EMPTY

@@ -10,23 +10,16 @@ from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.shapes import Mesh
 from sdfhub.whole_file import write_whole
 
-FORMATS = ("ply", "obj", "glb")
-"""Formats of written meshes."""
-
+FORMATS = ("ply", "obj", "glb")  # formats of written meshes
 FAR = 16
 """Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as in
 geographic coordinates. GLB has no other coordinates; OBJ is text."""
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Writes a mesh in the format of the path's suffix, whole or not at all.
+    """Writes a mesh [V, 3], [F, 3] in the format of the path's suffix, one of FORMATS, whole or not at all.
 
     Without faces nothing is written, and an earlier mesh there is removed.
-
-    Args:
-        vertices: [V, 3], in any frame.
-        faces: [F, 3].
-        path: ends in one of FORMATS.
     """
     if not len(faces):
         path.unlink(missing_ok=True)
@@ -51,13 +44,7 @@ def _ply(vertices: np.ndarray, faces: np.ndarray) -> bytes:
 
 
 def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
-    """Writes meshes side by side as one scene, upright for viewers (+y up); empty ones are left out.
-
-    Args:
-        meshes: in the normalised frame.
-        up: their axis that points up.
-        path: of a .glb file.
-    """
+    """Writes meshes, normalised frame, side by side as a .glb, upright for viewers; leaves out empty ones."""
     import trimesh
 
     scene = trimesh.Scene()

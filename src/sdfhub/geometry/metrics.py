@@ -44,18 +44,15 @@ class ShapeMetrics:
         excess: cd - floor; below 0 by chance where a reconstruction is as good as the truth.
         cd_source: `cd` in squared units of the source's own frame.
         point_to_surface: mean of `accuracy` and `completeness`.
-        accuracy: mean distance from the reconstruction's samples to the true surface.
-        accuracy_p95: 95th percentile of the same.
-        completeness: mean distance from the truth's samples to the reconstructed surface.
-        completeness_p95: 95th percentile of the same.
+        accuracy, accuracy_p95: mean and 95th percentile of the distance from the reconstruction's samples to
+            the true surface.
+        completeness, completeness_p95: the same from the truth's samples to the reconstructed surface.
         normal_consistency: mean |n . n'| over nearest samples, both directions averaged, in [0, 1].
         f_score: harmonic mean of the shares of either side's samples within tau of the other surface.
         iou: volume of the intersection over that of the union; None unless both meshes are closed.
         cd_penalty: `cd` of a single point at the origin, which stands for a failed reconstruction.
         failed: the reconstruction has no surface. Everything but `floor` and `cd_penalty` is None then.
-        vertices: count in the reconstruction.
-        faces: count in the reconstruction.
-        pieces: connected pieces of the reconstruction: parts of the shape, and crumbs that float beside it.
+        vertices, faces, pieces: counts in the reconstruction; pieces are connected, crumbs among them.
     """
 
     cd: float | None

@@ -18,8 +18,7 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 from sdfhub.shapes import Observation
 
-KNOWN = 5e-3
-"""Bounds no further apart than this, normalised frame, make a signed sample: their middle."""
+KNOWN = 5e-3  # bounds no further apart than this, normalised frame, make a signed sample: their middle
 
 
 @dataclass(frozen=True)

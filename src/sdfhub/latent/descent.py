@@ -15,8 +15,7 @@ class Quadratic(NamedTuple):
     hessian: Tensor
 
 
-ROWS_AT_ONCE = 2**12
-"""Rows differentiated at a time on a CPU, by each thread; bounds memory."""
+ROWS_AT_ONCE = 2**12  # rows differentiated at a time on a CPU, by each thread; bounds memory
 
 
 def values_and_jacobian(

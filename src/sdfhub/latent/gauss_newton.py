@@ -17,11 +17,8 @@ from sdfhub.latent.similarity import PoseRange, small_similarity
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Observation
 
-ROWS_TOGETHER = 2**14
-"""Rows of descents that are worked on together, or one shape's; bounds memory."""
-
-CODES_TOGETHER = 64
-"""Training codes compared at a time with an observation."""
+ROWS_TOGETHER = 2**14  # rows of descents that are worked on together, or one shape's; bounds memory
+CODES_TOGETHER = 64  # training codes compared at a time with an observation
 
 
 class Descents(NamedTuple):

@@ -51,7 +51,9 @@ class Rows(NamedTuple):
     ) -> "Rows":
         """B observations of equally many points as tensors; `soft` is their noise, at least `smallest`."""
         names = ("points", "low", "high", "unsigned")
-        parts = [torch.from_numpy(np.stack([getattr(each, name) for each in observations])) for name in names]
+        parts = [
+            torch.from_numpy(np.stack([getattr(shape, name) for shape in observations])) for name in names
+        ]
         soft = torch.tensor([max(smallest, observation.noise) for observation in observations])
         return cls(*(part.to(device) for part in (*parts, soft, torch.tensor(prior))))
 

@@ -8,9 +8,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-SIZE = 7
-"""Numbers of a small similarity: log scale, rotation vector [3] in radians, shift [3]."""
-
+SIZE = 7  # numbers of a small similarity: log scale, rotation vector [3] in radians, shift [3]
 AXES = {"y": 1, "z": 2}
 
 

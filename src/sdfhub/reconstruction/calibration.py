@@ -28,8 +28,8 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
+# what is judged: kept beside the settings, so that limits of another rule are not taken for these
 RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
-"""What is judged: kept beside the settings, so that limits of another rule are not taken for these."""
 
 
 @dataclass(frozen=True)

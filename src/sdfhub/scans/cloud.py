@@ -5,20 +5,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 10
-"""Points that a tangent plane is fitted to."""
-
+NEIGHBOURS = 10  # points that a tangent plane is fitted to
+# points that noise is measured on: of more, neighbours would lie within the noise of each other
 ENOUGH = 8192
-"""Points that noise is measured on: of more, neighbours would lie within the noise of each other."""
-
+# places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)
 QUIETEST, SHARE = 0.3, 0.817
-"""Places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)."""
-
-EDGE = 1.2
-"""Half the edge of the cube in which the outside is flooded, normalised frame."""
-
-RAYS = 4
-"""Rays nearest to a place that must all have passed it."""
+EDGE = 1.2  # half the edge of the cube in which the outside is flooded, normalised frame
+RAYS = 4  # rays nearest to a place that must all have passed it
 
 
 def spacing_of(points: np.ndarray) -> float:
@@ -53,12 +46,8 @@ def grid_of(axis: np.ndarray) -> np.ndarray:
 def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> np.ndarray:
     """[Q] whether places `at` [Q, 3] can be reached from afar without coming near a cloud [N, 3].
 
-    A flood fill of the cube [-1.2, 1.2]^3. Where the cloud has gaps wider than twice the reach, it comes in.
-
-    Args:
-        points, at: normalised frame.
-        reach: how near is near; more than the gaps between points, less than the parts between them.
-        cells: of the cube along an axis.
+    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`; it comes in where the
+    cloud has gaps wider than twice that.
     """
     nodes = grid_of(np.linspace(-EDGE, EDGE, cells))
     near = np.isfinite(cKDTree(points).query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
@@ -75,12 +64,7 @@ def cell_radius(cells: int) -> float:
 def winding(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, at: np.ndarray) -> np.ndarray:
     """[Q] winding numbers of an oriented cloud about the points `at` [Q, 3]: near 1 inside, 0 outside.
 
-    Source: Barill et al. 2018.
-
-    Args:
-        points, normals: [N, 3] of the cloud.
-        areas: [N] of the surface, that its points stand for.
-        at: [Q, 3].
+    Source: Barill et al. 2018, with the areas [N] that points stand for.
     """
     return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
 

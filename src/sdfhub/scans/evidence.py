@@ -11,17 +11,10 @@ from scipy.spatial import cKDTree
 from sdfhub.scans import cloud
 from sdfhub.shapes import Observation
 
-GAPS = 3
-"""Median distances between neighbours that a random cloud may leave bare around a point."""
-
-PLANES = 8
-"""Nearest points whose tangent planes a place is at least from: at an edge, those of both sides."""
-
-BOUNDS = 2
-"""Raised when the same scan gives other bounds: what was measured with the old ones counts no more."""
-
-SEALED = 5
-"""Median distances between neighbours that no gap of a random cloud reaches across."""
+GAPS = 3  # median distances between neighbours that a random cloud may leave bare around a point
+PLANES = 8  # nearest points whose tangent planes a place is at least from: at an edge, those of both sides
+BOUNDS = 2  # raised when the same scan gives other bounds: what was measured with the old ones counts no more
+SEALED = 5  # median distances between neighbours that no gap of a random cloud reaches across
 
 Share = Annotated[float, Field(ge=0, le=1)]
 

@@ -19,14 +19,10 @@ from sdfhub.shapes import NORMALIZED, Frame, Observation
 ScanFrame = Frame | Literal["shape", "unknown"]
 """How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
 
-MOST = 2**16
-"""Points of a cloud that are used: a random draw of more."""
-
+MOST = 2**16  # points of a cloud that are used: a random draw of more
+# distance of the farthest point from the origin that a scan in the normalised frame may have
 LARGEST, SMALLEST = 1.2, 0.2
-"""Distance of the farthest point from the origin that a scan in the normalised frame may have."""
-
-FAR = 2.5
-"""The same of signed samples, which are also drawn around the shape."""
+FAR = 2.5  # the same of signed samples, which are also drawn around the shape
 
 
 @dataclass(frozen=True)

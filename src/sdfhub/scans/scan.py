@@ -15,9 +15,7 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Frame
 
 FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
-LEAST = 50
-"""Points from which a shape may be guessed."""
-
+LEAST = 50  # points from which a shape may be guessed
 _PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
 _HEADER = re.compile(rb"\Aply\r?\n.*?end_header\r?\n", re.DOTALL)
 _FACES = re.compile(rb"^element\s+(?:face|tristrips)\s+[1-9]", re.MULTILINE)

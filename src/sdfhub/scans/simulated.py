@@ -17,21 +17,14 @@ from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, NormalizedMesh
 
+# levels of noise that are told apart, normalised frame
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
-"""Levels of noise that are told apart, normalised frame."""
-
+# half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away
 HALF_VIEW = np.tan(np.radians(24))
-"""Half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away."""
-
-DISTANCE, HEIGHT = 2.5, 0.5
-"""Of sensors from the origin, and how far up they may stand, as a sine."""
-
+DISTANCE, HEIGHT = 2.5, 0.5  # of sensors from the origin, and how far up they may stand, as a sine
 PIXELS = 100
-LOOKS = 20
-"""Places tried for a sensor, until it sees enough points to know a shape."""
-
-VIEWS = 2
-"""Simulated of each shape: a view depends on where the sensor stood."""
+LOOKS = 20  # places tried for a sensor, until it sees enough points to know a shape
+VIEWS = 2  # simulated of each shape: a view depends on where the sensor stood
 
 
 @dataclass(frozen=True)
@@ -64,13 +57,10 @@ class ScanKind:
 
     def observations(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[ObservedScan]:
         """Simulated scans of shapes, observed in the normalised frame: one of each shape, several views."""
-        numbers = range(VIEWS if self.kind == "view" else 1)
-        return [self.observe(shape, evidence, number) for shape in shapes for number in numbers]
-
-    def observe(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> ObservedScan:
-        """A simulated scan of a shape, observed; another number gives another one."""
-        rng = np.random.default_rng([shape_seed(shape), number])
-        return observe(self.scan(shape, number), evidence, NORMALIZED, rng)
+        pairs = [(shape, number) for shape in shapes for number in range(VIEWS if self.kind == "view" else 1)]
+        rngs = [np.random.default_rng([shape_seed(shape), number]) for shape, number in pairs]
+        scans = [self.scan(*pair) for pair in pairs]
+        return [observe(scan, evidence, NORMALIZED, rng) for scan, rng in zip(scans, rngs, strict=True)]
 
     def scan(self, shape: StoredShape, number: int = 0) -> Scan:
         """A simulated scan of a shape, in the normalised frame; another number gives another one.
@@ -106,14 +96,7 @@ def random_sensor(rng: np.random.Generator, up: UpAxis) -> np.ndarray:
 def surface_scan(
     mesh: NormalizedMesh, count: int, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [count, 3] spread evenly over a mesh, and their faces' normals.
-
-    Args:
-        mesh: its faces turned outwards.
-        count: points.
-        noise: standard deviation along each axis, normalised frame, of what the points are moved by.
-        rng: of the points.
-    """
+    """Points [count, 3] spread evenly over a mesh, moved by noise of that deviation, and normals there."""
     points, normals = sample_surface(mesh.vertices, mesh.faces, count, rng)
     return points + noise * rng.standard_normal(points.shape), normals
 
@@ -121,14 +104,9 @@ def surface_scan(
 def view_scan(
     mesh: NormalizedMesh, sensor: np.ndarray, pixels: int, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """What a sensor that looks at the origin sees of a mesh: [M, 3] points, at most one a pixel.
+    """What a sensor [3] outside the unit ball that looks at the origin sees of a mesh: [M, 3] points.
 
-    Args:
-        mesh: what stands there.
-        sensor: [3], outside the unit ball, normalised frame.
-        pixels: of the picture, either way.
-        noise: standard deviation along the rays.
-        rng: of the noise.
+    At most one of each of the picture's pixels * pixels; noise is the standard deviation along the rays.
     """
     scene = EmbreeScene()
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
