@@ -14,7 +14,7 @@ from sdfhub.evaluation.judging import Evaluation, judge_all
 from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, table, write_scores
 from sdfhub.geometry.metrics import judge
 from sdfhub.latent.gauss_newton import GaussNewtonFit
-from sdfhub.shapes import Mesh
+from sdfhub.shapes import Frame, Mesh
 from tests.test_metrics import EMPTY, icosphere, truth
 
 RADII = (0.5, 0.52, 0.55, 0.6)
@@ -28,7 +28,7 @@ def settings(**changes) -> Evaluation:
 def shapes(count: int) -> list[SimpleNamespace]:
     mesh = truth(icosphere(0.55, 3))
     return [
-        SimpleNamespace(id=f"{row}", mesh=mesh, scale=2.0, center=np.ones(3), up="z") for row in range(count)
+        SimpleNamespace(id=f"{row}", mesh=mesh, frame=Frame(np.ones(3), 2.0), up="z") for row in range(count)
     ]
 
 

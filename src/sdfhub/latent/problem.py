@@ -59,7 +59,8 @@ class Rows(NamedTuple):
 
     def some(self, shapes: Tensor | slice, every: int = 1) -> "Rows":
         """Every so many-th row of some shapes."""
-        return Rows(*(part[shapes][:, ::every] for part in self[:4]), self.soft[shapes], self.prior[shapes])
+        parts = [part[shapes][:, ::every] for part in self[:4]]
+        return Rows(*parts, *(part[shapes] for part in self[4:]))
 
     def turned(self, rotations: Tensor) -> "Rows":
         """The same with points under rotations, [3, 3] or [B, 3, 3]."""
@@ -144,7 +145,7 @@ class Problem:
         shapes, count = rows.low.shape
 
         def violation_of(copies: Tensor, *bounded: Tensor) -> Tensor:
-            single = Rows(*bounded, rows.soft, rows.prior)
+            single = Rows(*bounded, *rows[4:])
             if not self.has_pose:
                 return violation(self.decoder, copies, single, self.delta)[:, 0]
             pose = small_similarity(copies[:, self.size :])
