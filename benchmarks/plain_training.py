@@ -7,12 +7,9 @@ double backward, and the whole batch is one piece on PyTorch's own threads. Data
 judging stay sdfhub's. `accuracy.py` runs it beside `train.py`; a test holds the two objectives equal.
 """
 
-from runs import run_benchmark
-
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
-import sys
 from itertools import zip_longest
 
 import torch
@@ -61,11 +58,9 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
 
 
 def main() -> None:
-    if {"-m", "--multirun"} & set(sys.argv):  # launchers may train in other processes, by sdfhub's own steps
-        raise SdfhubError("-m: this makes one training; leave it out")
     AutoDecoder.objective = objective
     train()
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

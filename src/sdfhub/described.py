@@ -62,8 +62,9 @@ def describe(value: Any, key: str = "") -> Any:
         return {str(name): describe(item, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [describe(item, key) for item in value]
-    if isinstance(value, functools.partial) and not value.args:
-        return {"_target_": _path(value.func), "_partial_": True, **describe(value.keywords, key)}
+    if isinstance(value, functools.partial):
+        named = inspect.signature(value.func).bind_partial(*value.args).arguments | value.keywords
+        return {"_target_": _path(value.func), "_partial_": True, **describe(named, key)}
     if inspect.isclass(value) or inspect.isfunction(value):
         return {"_target_": _path(value), "_partial_": True}
     if dataclasses.is_dataclass(value):

@@ -6,7 +6,7 @@ import numpy as np
 
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, nearest_points
+from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points, pseudo_normal_signs
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
@@ -46,10 +46,11 @@ def prepare_mesh(
     normalized = normalize_mesh(vertices, faces, preparation)
     rng = np.random.default_rng(seed)
     surface = closed_surface(normalized) if preparation.sign == "winding" else None
-    signed = _signed_samples(surface, "pseudo_normal", preparation, rng) if surface else None
+    signed = _signed_samples(surface, pseudo_normal_signs, preparation, rng) if surface else None
     if not surface or not signed or not _winding_agrees(surface, signed[0], signed[1], rng):
         surface = visible_surface(normalized, preparation, rng)
-        signed = _signed_samples(surface, preparation.sign, preparation, rng)
+        method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
+        signed = _signed_samples(surface, method, preparation, rng)
     points, sdf, statistics = signed
     certain, inside = statistics["certain"], statistics["inside"]
     low, high = preparation.min_inside, preparation.max_inside
@@ -88,12 +89,12 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
 
 
 def _signed_samples(
-    surface: Surface, sign: str, preparation: Preparation, rng: np.random.Generator
+    surface: Surface, sign: SignMethod, preparation: Preparation, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Shuffled points [N, 3], their signed distances [N], and statistics."""
     points = sample_points(surface, preparation, rng)
     nearest = nearest_points(points, surface)
-    signs = SIGN_METHODS[sign](points, nearest, surface, rng)
+    signs = sign(points, nearest, surface, rng)
     statistics = {"fast_path": 0.0, **surface.statistics, "certain": float(signs.certain.mean())}
     statistics |= {"inside": float(signs.inside.mean()), "faces": float(len(surface.faces))}
     sdf = np.where(signs.inside, -nearest.distance, nearest.distance)

@@ -1,5 +1,6 @@
 """How one mesh becomes signed samples: plain numbers, filled from YAML and hashed by the store."""
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -14,7 +15,8 @@ class Preparation:
     those of its paper; `min_*` and `max_*` are the limits beyond which `prepare_mesh` raises `RejectedMesh`.
     """
 
-    sign: Literal["winding", "vote", "pseudo_normal"] = "winding"  # takes the last on clean closed meshes
+    # a method's name (winding takes pseudo_normal on clean closed meshes), or one's own `signs.SignMethod`
+    sign: Literal["winding", "vote", "pseudo_normal"] | Callable = "winding"
     samples: PositiveInt = 500_000  # of a shape, signed
     near_share: Annotated[float, Field(ge=0, le=1)] = 0.94  # near the surface; the rest in [-1, 1]^3
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)  # of the jitter

@@ -40,6 +40,7 @@ class Signs(NamedTuple):
 
 
 SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs]
+"""Takes points [N, 3], their nearest points of the surface, the surface and a source of chance."""
 
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:

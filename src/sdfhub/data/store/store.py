@@ -30,6 +30,7 @@ from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_of, write_shape
 from sdfhub.data.workers import Crashed, map_in_processes
+from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
 from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
@@ -136,7 +137,7 @@ def prepare_part(
 
 def preparation_hash(preparation: Preparation) -> str:
     """12 hex digits that change with every setting of the preparation and with VERSION."""
-    settings = json.dumps([VERSION, asdict(preparation)], sort_keys=True)
+    settings = json.dumps([VERSION, asdict(preparation)], sort_keys=True, default=describe)
     return hashlib.sha256(settings.encode()).hexdigest()[:12]
 
 
@@ -235,7 +236,7 @@ def _checked(
         about = {"source": source.name} | asdict(preparation)
         index = {"about": about, "checked": dict(sorted((known | states).items()))}
         with suppress(OSError):  # a store that others own is read all the same
-            write_whole(folder / INDEX, json.dumps(index, indent=1))
+            write_whole(folder / INDEX, json.dumps(index, indent=1, default=describe))
     return stored
 
 
