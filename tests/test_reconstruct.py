@@ -258,7 +258,7 @@ def test_plain_words_name_the_run_and_the_scans(run, scans, tmp_path, monkeypatc
 
 MISTAKES = {
     "frame=metres": ["frame", "metres"],
-    "fit.nearest=-1": ["fit", "negative"],
+    "fit.nearest=-1": ["fit.nearest=-1"],
     "evidence.cells=2": ["evidence", "cells"],
     "resolution=1": ["resolution=1"],
     "sensor=[1,2]": ["sensor"],
