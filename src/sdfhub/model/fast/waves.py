@@ -48,11 +48,11 @@ def fits(activation: Activation, product: Tensor, shift: Tensor) -> TypeGuard[Si
     """Whether the loops compute a(product + shift): a sine or HOSC, in float32 on the CPU."""
     return (
         type(activation) in (Siren, Hosc)  # a subclass may be another function
+        and not torch.compiler.is_compiling()  # first: a comparison of sizes would be a guard of an export
         and product.is_cpu
         and product.dtype == torch.float32
         and product.numel() > 0
         and shift.shape in (product.shape[2:], (product.shape[0], 1, product.shape[2]))
-        and not torch.compiler.is_compiling()
         and not torch.is_autocast_enabled("cpu")
     )
 
