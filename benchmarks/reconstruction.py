@@ -109,7 +109,7 @@ def applied(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 def observed(how: Reconstructor, kind: ScanKind, shape: StoredShape) -> tuple[ObservedScan, np.ndarray]:
     """A scan of a shape, and the matrix from its frame to the normalised one."""
     if how.poses is None:
-        return kind.observe(shape, how.evidence), np.eye(4)
+        return kind.observations([shape], how.evidence)[0], np.eye(4)
     scan, back = moved(kind.scan(shape), shape)
     return observe(scan, how.evidence, "unknown", np.random.default_rng(shape_seed(shape))), back
 

@@ -82,7 +82,7 @@ def test_a_training_told_to_stop_leaves_a_checkpoint_its_status_and_goes_on(numb
     assert process.returncode == status, told
     assert f"{number.name}: stopping after this step" in told and "Traceback" not in told
     done = run(["train.py"], *words)
-    assert "goes on from last.ckpt" in done.stdout
+    assert "continues from last.ckpt" in done.stdout
     assert_same(folder, expected)
     assert "finished before" in run(["train.py"], *words).stdout
 
@@ -99,7 +99,7 @@ def test_a_job_that_slurm_queues_again_goes_on(undisturbed, tmp_path):
     assert process.returncode == 143 and (tmp_path / "asked").read_text() == "requeue 4711\n", told
     process = begun(words, tmp_path, **slurm)
     told, _ = process.communicate(timeout=200)
-    assert process.returncode == 0 and "goes on from last.ckpt" in told
+    assert process.returncode == 0 and "continues from last.ckpt" in told
     (folder,) = tmp_path.glob("outputs/*/slurm-4711_*")
     assert_same(folder, expected)
 
@@ -139,7 +139,7 @@ def test_two_processes_told_to_stop_leave_one_checkpoint_and_go_on(undisturbed):
     assert not processes_of(str(folder))
     stopped = read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"]
     done = run(["train.py"], *words)
-    assert "goes on from last.ckpt" in done.stdout
+    assert "continues from last.ckpt" in done.stdout
     assert 0 < stopped < read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"] == 400
 
 
