@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tempfile
 from pathlib import Path
 
 import torch
@@ -43,6 +44,9 @@ TINY = [
     "validation.points=500",
 ]
 
+UNUSED = tempfile.TemporaryDirectory(prefix="sdfhub-")
+"""Where a composed config that is not run as a task says that it writes."""
+
 
 def run_command(monkeypatch, *words: str, task: str = "train") -> int:
     """The exit status of a command in this process."""
@@ -72,7 +76,7 @@ def composed(*words: str, config_name: str = "config") -> DictConfig:
         config = compose(config_name, list(words), return_hydra_config=True)
     with open_dict(config):
         if OmegaConf.is_missing(config.hydra.runtime, "output_dir"):
-            config.hydra.runtime.output_dir = "unused"
+            config.hydra.runtime.output_dir = UNUSED.name
         HydraConfig.instance().set_config(config)
         del config["hydra"]
     return config
