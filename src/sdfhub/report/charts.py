@@ -26,7 +26,8 @@ def loss_chart(group: Group) -> str | None:
     for row in group.rows:
         for number, curve in enumerate(filter(None, (loss_curve(cell.folder) for cell in row.done))):
             label = _text(row.label) if number == 0 else None
-            axes.plot(*zip(*curve, strict=True), **_style(group, row), lw=1.3, label=label)
+            line = "-" if row.normals == "on" else "--"
+            axes.plot(*zip(*curve, strict=True), color=_colour(group, row), ls=line, lw=1.3, label=label)
     if not axes.lines:
         return None
     axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
@@ -47,14 +48,15 @@ def shape_chart(group: Group, role: str) -> str | None:
     figure = Figure((7.6, 0.8 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for height, row in enumerate(rows):
-        line = shapes[shapes["label"] == row.label]
-        style, cds = _style(group, row), line["cd"].to_numpy()
+        line, colour = shapes[shapes["label"] == row.label], _colour(group, row)
+        cds = line["cd"].to_numpy()
         spread = height + 0.035 * (np.arange(len(cds)) * 5 % 9 - 4)  # the same at every drawing
-        face = style["color"] if row.normals == "on" else "none"
-        axes.scatter(cds, spread, s=14, color=face, edgecolors=style["color"], alpha=0.7)
-        axes.vlines(np.median(cds), height - 0.35, height + 0.35, color=style["color"], lw=2.5)
+        face = colour if row.normals == "on" else "none"
+        axes.scatter(cds, spread, s=14, color=face, edgecolors=colour, alpha=0.7)
+        axes.vlines(np.median(cds), height - 0.35, height + 0.35, color=colour, lw=2.5)
+        worst = cds.argmax()
         place = {"xytext": (5, 0), "textcoords": "offset points", "fontsize": 7, "va": "center"}
-        axes.annotate(_text(line["shape"].iloc[cds.argmax()]), (cds.max(), spread[cds.argmax()]), **place)
+        axes.annotate(_text(line["shape"].iloc[worst]), (cds[worst], spread[worst]), **place)
     axes.axvline(shapes["floor"].mean(), color="#5d6672", ls=":", lw=1)
     axes.set(xscale="log", xlabel="CD times 10³ (dotted: noise floor)", ylim=(len(rows) - 0.5, -0.5))
     axes.set_yticks(range(len(rows)), [_text(row.label) for row in rows])
@@ -70,14 +72,14 @@ def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tupl
         scalars = EventAccumulator(str(folder), size_guidance=KEEP).Reload().Scalars(tag)
     except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
         return []
-    found = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
-    return found[::-1][:: max(1, -(-len(found) // points))][::-1]
+    curve = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
+    return curve[::-1][:: max(1, -(-len(curve) // points))][::-1]
 
 
-def _style(group: Group, row: Row) -> dict[str, str]:
-    """A colour for each method; dashed without normals."""
-    methods = list(dict.fromkeys(other.method for other in group.rows))
-    return {"color": f"C{methods.index(row.method) % 10}", "ls": "-" if row.normals == "on" else "--"}
+def _colour(group: Group, row: Row) -> str:
+    """A colour for each method."""
+    methods = list(dict.fromkeys(rival.method for rival in group.rows))
+    return f"C{methods.index(row.method) % 10}"
 
 
 def _text(text: str) -> str:

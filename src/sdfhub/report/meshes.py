@@ -36,19 +36,17 @@ class ShownMesh:
 def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
     """The true mesh; None where it cannot be had."""
     mesh = truth.mesh if truth else None
-    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if mesh else None
+    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if truth and mesh else None
 
 
-def reconstruction(
-    cell: Path, role: str, score: ShapeScore | None, truth: StoredShape | None
-) -> ShownMesh | None:
+def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
     """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
 
     Where the truth is not there to say what the frame was, the mesh's own extent does.
     """
     folder = cell / "meshes" / role
-    path = folder / f"{score.id}.ply" if score and not score.failed else folder
-    if not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
+    path = folder / f"{score.id}.ply"
+    if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
     try:
         with path.open("rb") as file:
@@ -71,10 +69,8 @@ def packed(mesh: ShownMesh, triangles: int) -> dict[str, int | str]:
     vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
     if len(faces) > triangles:
         vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))
-    if len(vertices) > 65_535:  # many loose triangles do not decimate
-        faces = faces[(faces < 65_535).all(axis=1)]
-        vertices = vertices[:65_535]
-    vertices = turned_up(vertices, mesh.up, "z")
+    faces = faces[(faces < 65_535).all(axis=1)]  # many loose triangles do not decimate
+    vertices = turned_up(vertices[:65_535], mesh.up, "z")
     places = (np.clip(vertices, -1, 1) * 32767).astype("<i2").tobytes()
-    data = base64.b64encode(places + np.asarray(faces).astype("<u2").tobytes()).decode()
+    data = base64.b64encode(places + faces.astype("<u2").tobytes()).decode()
     return {"vertices": len(vertices), "faces": len(faces), "data": data}

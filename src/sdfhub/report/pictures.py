@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,12 +28,23 @@ A_WORKERS_WORTH = 32
 """Meshes for which it pays to start a process that draws them."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Tile:
-    """A picture [S, S, 3] uint8, None where there is nothing to draw, and the text below or in its place."""
+    """A place of a sheet: a picture, or a text in its place.
 
-    image: np.ndarray | None
+    Args:
+        text: below the picture.
+        instead: in the place of a picture that is not there.
+        key: equal where two tiles show one picture.
+        read: reads the mesh to draw, in whatever process; None without one.
+        image: [S, S, 3] uint8, once drawn.
+    """
+
     text: str = ""
+    instead: str = ""
+    key: Hashable = None
+    read: Callable[[], ShownMesh | None] | None = None
+    image: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -44,6 +55,7 @@ class Sheet:
     rows: list[tuple[str, list[Tile]]]
 
 
+@dataclass(frozen=True)
 class Gallery:
     """Pictures of the shapes of a report, each drawn once.
 
@@ -51,48 +63,42 @@ class Gallery:
         find_truth: prepared shapes by cell and id.
     """
 
-    def __init__(self, find_truth: FindTruth):
-        self.find_truth = find_truth
-        self._wanted: dict[tuple, Callable[[], ShownMesh | None]] = {}
-        self._images: dict[tuple, np.ndarray | None] = {}
+    find_truth: FindTruth
 
     def sheets(self, groups: list[Group], count: int) -> list[tuple[Sheet, Sheet]]:
-        """The contact sheet and the extremes of each group, drawn in as many processes as it is worth.
+        """The contact sheet and the extremes of each group, drawn in as many processes as it is worth."""
+        pairs = [(self._sheet(group, count), self._extremes(group)) for group in groups]
+        tiles = [tile for pair in pairs for sheet in pair for _, row in sheet.rows for tile in row]
+        readers = {tile.key: tile.read for tile in tiles if tile.read}
+        workers = workers_worth(len(readers), A_WORKERS_WORTH)
+        images = dict(zip(readers, stream_in_processes(picture, readers.values(), workers), strict=True))
+        for tile in tiles:
+            tile.image = images.get(tile.key)
+        return pairs
 
-        Made twice: first without pictures, which says what is to be drawn.
-        """
-        for _ in range(2):
-            sheets = [(self.sheet(group, count), self.extremes(group)) for group in groups]
-            left = {key: mesh for key, mesh in self._wanted.items() if key not in self._images}
-            workers = workers_worth(len(left), A_WORKERS_WORTH)
-            images = stream_in_processes(picture, list(left.values()), workers)
-            self._images |= dict(zip(left, images, strict=True))
-        return sheets
-
-    def sheet(self, group: Group, count: int) -> Sheet:
+    def _sheet(self, group: Group, count: int) -> Sheet:
         """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6."""
         shown = chosen(group, count)
         cells = [row.first for row in group.rows if row.first]
-        rows = [("Ground truth", [self._truth_tile(cells[0], id) for _, id in shown])] if cells else []
-        rows = [row for row in rows if any(tile.image is not None for tile in row[1])]
+        truth = [self._truth_tile(cells[0], id) for _, id in shown]
+        rows = [("Ground truth", truth)] if any(tile.read for tile in truth) else []
         for row in group.rows:
-            absent = Tile(None, "failed" if any(cell.state == "failed" for cell in row.cells) else "missing")
-            rows.append(
-                (row.label, [self._tile(row.first, *shape) if row.first else absent for shape in shown])
-            )
+            absent = "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
+            tiles = [self._tile(row.first, *shape) if row.first else Tile(instead=absent) for shape in shown]
+            rows.append((row.label, tiles))
         return Sheet([f"{id} ({role.replace('_', ' ')})" for role, id in shown], rows)
 
-    def extremes(self, group: Group) -> Sheet:
+    def _extremes(self, group: Group) -> Sheet:
         """Best, median and worst training shape of each row, the truth beside each."""
         rows = []
         for row in group.rows:
             scores = _scores(row.first, "train").values() if row.first else []
             ids = [score.id for score in sorted(scores, key=lambda score: score.excess)]
-            for_row = [ids[0], ids[(len(ids) - 1) // 2], ids[-1]] if ids else []
-            tiles = [
-                (self._truth_tile(row.first, id, id), self._tile(row.first, "train", id)) for id in for_row
-            ]
-            rows += [(row.label, [tile for pair in tiles for tile in pair])] if tiles else []
+            if row.first and ids:
+                tiles = []
+                for id in (ids[0], ids[(len(ids) - 1) // 2], ids[-1]):
+                    tiles += [self._truth_tile(row.first, id, id), self._tile(row.first, "train", id)]
+                rows.append((row.label, tiles))
         return Sheet(["best: truth", "best", "median: truth", "median", "worst: truth", "worst"], rows)
 
     def turning(self, groups: list[Group], count: int) -> list[list[dict]]:
@@ -104,37 +110,31 @@ class Gallery:
         return [self._turning(group, min(count, TO_TURN), MESH_BYTES // len(groups)) for group in groups]
 
     def _turning(self, group: Group, count: int, room: int) -> list[dict]:
-        shown, rows = chosen(group, count), [row for row in group.rows if row.first]
-        triangles = room // max(1, len(shown) * (len(rows) + 1) * 12)  # some 12 bytes each, as base64
+        shown, cells = chosen(group, count), {row.label: row.first for row in group.rows if row.first}
+        triangles = room // max(1, len(shown) * (len(cells) + 1) * 12)  # some 12 bytes each, as base64
         triangles = min(MOST, max(FEWEST, triangles))
         shapes = []
         for role, id in shown:
-            meshes = {"Ground truth": true_mesh(self.find_truth(rows[0].first, id))}
-            meshes |= {row.label: self._mesh(row.first, role, id)() for row in rows}
+            meshes = {"Ground truth": true_mesh(self.find_truth(next(iter(cells.values())), id))}
+            for label, cell in cells.items():
+                read = self._tile(cell, role, id).read
+                meshes[label] = read() if read else None
             panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes.items() if mesh]
             shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
         return shapes
 
-    def _mesh(self, cell: Cell, role: str, id: str) -> Callable[[], ShownMesh | None]:
-        """Reads the reconstruction of a shape, in whatever process."""
-        score = _scores(cell, role).get(id)
-        return partial(reconstruction, cell.folder, role, score, self.find_truth(cell, id))
-
     def _tile(self, cell: Cell, role: str, id: str) -> Tile:
         score = _scores(cell, role).get(id)
         if score is None or score.failed:
-            return Tile(None, "no surface" if score else "not judged")
-        image = self._image((cell.folder, role, id), self._mesh(cell, role, id))
-        return Tile(image, "no mesh" if image is None else f"CD {score.counted_cd * TABLE_UNIT:.3f}")
+            return Tile(instead="no surface" if score else "not judged")
+        read = partial(reconstruction, cell.folder, role, score, self.find_truth(cell, id))
+        return Tile(f"CD {score.counted_cd * TABLE_UNIT:.3f}", "no mesh", (cell.folder, role, id), read)
 
     def _truth_tile(self, cell: Cell, id: str, caption: str = "") -> Tile:
         truth = self.find_truth(cell, id)
-        image = self._image(("truth", truth.fingerprint), partial(true_mesh, truth)) if truth else None
-        return Tile(image, "no truth" if image is None else caption)
-
-    def _image(self, key: tuple, mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
-        self._wanted[key] = mesh
-        return self._images.get(key)
+        if truth is None or not truth.rows("faces"):
+            return Tile(instead="no truth")
+        return Tile(caption, "no truth", truth.fingerprint, partial(true_mesh, truth))
 
 
 def picture(read_mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
@@ -146,15 +146,15 @@ def picture(read_mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     """Role and id of the shapes to show: the first training ones, and up to a third held out."""
     cell = next((cell for row in group.rows for cell in row.done), None)
-    train, unseen = (list(_scores(cell, role)) if cell else [] for role in ROLES)
-    unseen = unseen[: max(count // 3, count - len(train))]
-    train = train[: count - len(unseen)]
-    return [("train", id) for id in train] + [("held_out", id) for id in unseen]
+    train, held_out = (list(_scores(cell, role)) if cell else [] for role in ROLES)
+    held_out = held_out[: max(count // 3, count - len(train))]
+    train = train[: count - len(held_out)]
+    return [("train", id) for id in train] + [("held_out", id) for id in held_out]
 
 
 def _scores(cell: Cell, role: str) -> dict[str, ShapeScore]:
     """The scores of a role by id; {} where shapes have no surfaces to be judged by."""
-    return {s.id: s for s in cell.scores.shapes.get(role, []) if isinstance(s, ShapeScore)}
+    return {s.id: s for s in cell.result.shapes.get(role, []) if isinstance(s, ShapeScore)}
 
 
 def data_uri(image: np.ndarray) -> str:

@@ -6,14 +6,14 @@ Nothing in a cell's files is run, and no link is followed out of its folder.
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked
-from sdfhub.report.plan import FAILURE, PlannedCell, read_plan
+from sdfhub.report.plan import FAILURE, PlannedCell, first_fault, read_plan
 from sdfhub.settings import flat
 
 NOISE = 1e-6
@@ -27,6 +27,7 @@ TABLE_UNIT = 1e3
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Name = Annotated[str, StringConstraints(max_length=300)]
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ShapeScore(BaseModel, frozen=True):
@@ -68,6 +69,12 @@ class DistanceScore(BaseModel, frozen=True):
         return {"sdf_error": self.sdf_error * TABLE_UNIT, "sign_accuracy": self.sign_accuracy}
 
 
+class RoleScores(BaseModel, frozen=True):
+    """The judged shapes of a role."""
+
+    shapes: list[ShapeScore | DistanceScore] = []
+
+
 class Training(BaseModel, frozen=True):
     """The cost of a training, and versions and hardware by name."""
 
@@ -75,6 +82,20 @@ class Training(BaseModel, frozen=True):
     steps: Count
     parameters: Count
     made_with: dict[Name, Name] = {}
+
+
+class Metrics(BaseModel, frozen=True):
+    """What `metrics.json` holds."""
+
+    training: Training
+    train: RoleScores | None = None
+    held_out: RoleScores | None = None
+
+
+class Split(BaseModel, frozen=True):
+    """What reports read of `split.json`."""
+
+    train: list[Name]
 
 
 @dataclass(frozen=True)
@@ -88,23 +109,23 @@ class Scores:
         config: the content of `config.yaml`.
     """
 
-    shapes: dict[str, list[ShapeScore] | list[DistanceScore]]
+    shapes: dict[str, list[ShapeScore | DistanceScore]]
     training: Training
     trained_on: int
     config: dict[str, Any]
 
-    def costs(self) -> dict[str, float | None]:
+    def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
-        costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
-        get = flat(self.config).get
+        costs: dict[str, float] = self.training.model_dump(exclude={"made_with"})
+        costs["trained_on"] = self.trained_on
+        settings = flat(self.config)
         try:
-            costs["epochs"] = min(int(get("trainer.max_epochs")), 10**12)
-            rows = self.trained_on * (1 + int(get("data.loader.augmentation.copies") or 0))
-            shapes = min(rows, int(get("data.loader.shapes_per_step")))
-            costs["samples"] = (
-                shapes * min(int(get("data.loader.samples_per_shape")), 10**12) * costs["steps"]
-            )
-        except (TypeError, ValueError, OverflowError):
+            costs["epochs"] = float(int(settings["trainer.max_epochs"]))
+            rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
+            shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
+            samples = shapes * int(settings["data.loader.samples_per_shape"])
+            costs["samples"] = float(samples * self.training.steps)
+        except (KeyError, TypeError, ValueError, OverflowError):
             pass  # a loader of the user's own
         return costs
 
@@ -127,6 +148,12 @@ class Cell:
     reason: str = ""
     scores: Scores | None = None
 
+    @property
+    def result(self) -> Scores:
+        """The scores of a cell that is done."""
+        assert self.scores is not None
+        return self.scores
+
 
 def read_sweep(sweep: Path) -> list[Cell]:
     """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing.
@@ -144,8 +171,7 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
         if is_locked(folder / ".lock"):
             return Cell(plan, folder, "missing", "is being trained")
         if (folder / FAILURE).exists():
-            reason = _loaded(folder, FAILURE).get("reason", "for a reason that was not written down")
-            return Cell(plan, folder, "failed", str(reason)[:500])
+            return Cell(plan, folder, "failed", str(_loaded(folder, FAILURE).get("reason"))[:500])
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
             return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
@@ -160,25 +186,18 @@ def read_scores(folder: Path) -> Scores:
     Raises:
         SdfhubError: a file is missing, broken or not what training writes.
     """
-    metrics = _loaded(folder, "metrics.json")
-    if "known" in metrics:  # the name of the role before it was `train`
-        metrics["train"] = metrics.pop("known")
-    shapes = {}
-    for role in filter(metrics.get, ROLES):
-        content = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}")
-        rows = _checked(list[dict], content.get("shapes"), f"metrics.json: {role}.shapes")
-        kind = DistanceScore if rows and "sdf_error" in rows[0] else ShapeScore
-        shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
-    training = _checked(Training, metrics.get("training"), "metrics.json: training")
-    trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
-    return Scores(shapes, training, len(trained_on), _loaded(folder, "config.yaml"))
+    metrics = _checked(Metrics, _loaded(folder, "metrics.json"), "metrics.json")
+    split = _checked(Split, _loaded(folder, "split.json"), "split.json")
+    roles = {"train": metrics.train, "held_out": metrics.held_out}
+    shapes = {role: scores.shapes for role, scores in roles.items() if scores}
+    return Scores(shapes, metrics.training, len(split.train), _loaded(folder, "config.yaml"))
 
 
 def _loaded(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise SdfhubError(f"{name}: is a link out of its folder")
     try:
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise SdfhubError(f"{name}: is a link out of its folder")
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
@@ -188,9 +207,8 @@ def _loaded(folder: Path, name: str) -> dict[str, Any]:
     return content
 
 
-def _checked(kind: Any, content: Any, name: str) -> Any:
+def _checked(kind: type[Model], content: dict[str, Any], name: str) -> Model:
     try:
-        return TypeAdapter(kind).validate_python(content)
+        return kind.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise SdfhubError(f"{'.'.join([name, *map(str, first['loc'])])}: {first['msg'].lower()}") from error
+        raise SdfhubError(f"{name}: {first_fault(error)}") from error

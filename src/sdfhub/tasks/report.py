@@ -40,12 +40,12 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     Raises:
         SdfhubError: not a sweep's folder.
     """
-    cells, commands = read_sweep(sweep), read_plan(sweep).commands
+    cells = read_sweep(sweep)
     groups = group_cells(cells)
     titles = ["All tables", *(group.title for group in groups), "Origin"]
-    found = [overview(groups), *map(tables, groups), [origin(commands, cells)]]
-    sections = [(title, some) for title, some in zip(titles, found, strict=True) if some]
-    text = "\n".join(markdown(title, some) for title, some in sections)
+    parts = [overview(groups), *map(tables, groups), [origin(read_plan(sweep).commands, cells)]]
+    sections = [(title, part) for title, part in zip(titles, parts, strict=True) if part]
+    text = "\n".join(markdown(title, part) for title, part in sections)
     print(f"\n{text}")
     write_whole(out / "table.md", f"# {sweep.name}\n\n{text}")
     write_whole(out / "table.tex", latex(sections))
@@ -55,7 +55,7 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     sheets, turning = gallery.sheets(groups, shapes), gallery.turning(groups, shapes)
     for group, (sheet, _) in zip(groups, sheets, strict=True):
         write_sheet(sheet, out / f"{sheet_name(group)}.png")
-    write_whole(out / "report.html", page(sweep.name, cells, groups, found, sheets, turning))
+    write_whole(out / "report.html", page(sweep.name, cells, groups, parts, sheets, turning))
     print(f"report: {out / 'report.html'}", flush=True)
     return cells
 
@@ -63,15 +63,14 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
 def sheet_name(group: Group) -> str:
     """A name of its own for each group of a sweep."""
     choices = [group.judging[name] for name in JUDGING_GROUPS if name in group.judging]
-    settings = sorted(set(group.judging) - set(JUDGING_GROUPS))
-    said = ";".join(f"{key}={group.judging[key]}" for key in settings)
-    digest = [hashlib.sha256(said.encode()).hexdigest()[:8]] if said else []
+    settings = ";".join(f"{k}={v}" for k, v in sorted(group.judging.items()) if k not in JUDGING_GROUPS)
+    digest = [hashlib.sha256(settings.encode()).hexdigest()[:8]] if settings else []
     return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *choices, *digest]))
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
-    rows = [[tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
+    rows = [[tile.instead if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
     if rows and sheet.columns:
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
@@ -82,9 +81,10 @@ def truth_finder() -> FindTruth:
     stores: dict[str, Store | None] = {}
 
     def find(cell: Cell, id: str) -> StoredShape | None:
-        key = str(cell.scores.config.get("data"))
+        config = cell.result.config
+        key = str(config.get("data"))
         if key not in stores:
-            stores[key] = _store(cell.scores.config)
+            stores[key] = _store(config)
         store = stores[key]
         return store[id] if store and id in store else None
 
