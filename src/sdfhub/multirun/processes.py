@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -23,16 +22,17 @@ log = logging.getLogger(__name__)
 
 def refuse_processes_in_multirun(trainer: Trainer) -> None:
     """Refuses a cell whose trainer would start processes: each of them would walk the whole multirun."""
-    starts = trainer.world_size > 1 and not trainer.strategy.cluster_environment.creates_processes_externally
+    cluster = getattr(trainer.strategy, "cluster_environment", None)
+    starts = trainer.world_size > 1 and not (cluster and cluster.creates_processes_externally)
     if starts and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise SdfhubError(
-            "trainer.devices: a cell of a multirun has one device, or processes started by SLURM; set 1"
+            "trainer.devices: a cell of a multirun has one device, or processes of SLURM; set 1"
         )
 
 
 @contextmanager
 def ending_together(trainer: Trainer) -> Iterator[None]:
-    """Ends a process with one line and status 1 where another of its run has died, 143 after SIGTERM.
+    """Ends a process where another of its run has died, and with status 143 after SIGTERM.
 
     Lightning watches the processes that the first one starts; nobody watches the first one.
     """
@@ -43,11 +43,13 @@ def ending_together(trainer: Trainer) -> Iterator[None]:
     except SIGTERMException as stop:
         raise SystemExit(143) from stop  # Lightning's has status 0
     except RuntimeError as error:  # gloo raises it bare, NCCL a kind of it
-        lost = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
-        if trainer.world_size == 1 or not lost:
+        if (
+            trainer.world_size == 1
+            or "onnection" not in str(error)
+            and not isinstance(error, torch.distributed.DistError)
+        ):
             raise
-        log.error(LOST)
-        sys.exit(1)
+        raise SdfhubError(LOST) from error
 
 
 def _end_with(parent: int) -> None:

@@ -2,8 +2,8 @@
 
 import base64
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
@@ -18,15 +18,8 @@ FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
 
-@dataclass(frozen=True)
-class ShownMesh:
-    """A mesh to be looked at.
-
-    Args:
-        vertices: [V, 3] float64, normalised frame, within the unit ball or nearly.
-        faces: [F, 3] int64.
-        up: the axis that points up.
-    """
+class ShownMesh(NamedTuple):
+    """A mesh to be looked at, normalised frame: vertices [V, 3] float64, faces [F, 3] int64, what points up."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -40,12 +33,11 @@ def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
 
 
 def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
-    """The reconstruction of a shape in a cell's folder, normalised frame; None where there is no surface.
+    """The reconstruction of a shape in a cell's folder; None where there is no surface.
 
-    Where the truth is not there to say what the frame was, the mesh's own extent does.
+    Where the truth is not there to say what the normalised frame was, the mesh's own extent does.
     """
-    folder = cell / "meshes" / role
-    path = folder / f"{score.id}.ply"
+    path = cell / "meshes" / role / f"{score.id}.ply"
     if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
     try:

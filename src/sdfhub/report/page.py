@@ -2,14 +2,17 @@
 
 import base64
 import hashlib
+import io
 from datetime import UTC, datetime
 from importlib.resources import files
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from PIL import Image
 
 from sdfhub.report.charts import loss_chart, shape_chart
-from sdfhub.report.pictures import Sheet, data_uri
+from sdfhub.report.pictures import Sheet
 from sdfhub.report.results import ROLES, Cell
 from sdfhub.report.rows import Group
 from sdfhub.report.tables import TITLES, Table
@@ -20,8 +23,8 @@ def page(
     cells: list[Cell],
     groups: list[Group],
     tables: list[list[Table]],
-    sheets: list[tuple[Sheet, Sheet]],
-    turning: list[list[dict]],
+    sheets: list[Sheet],
+    turning: list,
 ) -> str:
     """The whole page as text.
 
@@ -30,14 +33,12 @@ def page(
         cells: all of them.
         groups: their rows.
         tables: those of all groups first, then each group's, then how the sweep was made.
-        sheets: of each group, the contact sheet and the extremes.
-        turning: of each group, the meshes to turn.
+        sheets, turning: of each group, the contact sheet, and the meshes to turn.
     """
     overview, *tables, origin = tables
     parts = [
-        {"title": group.title, "tables": own, "charts": _charts(group), "turning": meshes}
-        | {"sheet": sheet, "extremes": extremes}
-        for group, own, (sheet, extremes), meshes in zip(groups, tables, sheets, turning, strict=True)
+        {"title": group.title, "tables": own, "charts": _charts(group), "sheet": sheet, "turning": meshes}
+        for group, own, sheet, meshes in zip(groups, tables, sheets, turning, strict=True)
     ]
     states = [cell.state for cell in cells]
     counts = [f"{states.count(state)} {state}" for state in ("failed", "missing") if state in states]
@@ -45,7 +46,7 @@ def page(
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     loader = PackageLoader("sdfhub.report", ".")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-    environment.filters["data_uri"] = data_uri
+    environment.filters["data_uri"] = _picture_uri
     return environment.get_template("page.html.j2").render(
         name=name,
         counts=", ".join([f"{states.count('done')} of {len(cells)} cells done", *counts]),
@@ -64,6 +65,12 @@ def _charts(group: Group) -> list[tuple[str, str]]:
     for role in ROLES:
         charts[f"{TITLES[role]}: CD of each, all seeds; the bar is the median"] = shape_chart(group, role)
     return [(caption, chart) for caption, chart in charts.items() if chart]
+
+
+def _picture_uri(image: np.ndarray) -> str:
+    content = io.BytesIO()
+    Image.fromarray(image).save(content, "WEBP", quality=82)
+    return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
 
 
 def _text(name: str) -> str:

@@ -21,20 +21,13 @@ FolderName = Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_l
 
 
 class PlannedCell(BaseModel):
-    """One cell as its command line described it.
-
-    Args:
-        folder: name of its folder below the sweep's.
-        choices: option by config group, `sweeps` among them.
-        settings: values set beside the groups and the seed, by dotted key.
-        seed: of the training.
-    """
+    """One cell as its command line described it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    folder: FolderName
-    choices: dict[Text, Text]
-    settings: dict[Text, Text]
+    folder: FolderName  # below the sweep's
+    choices: dict[Text, Text]  # option by config group, `sweeps` among them
+    settings: dict[Text, Text]  # values set beside the groups and the seed, by dotted key
     seed: int
 
     @property

@@ -6,18 +6,15 @@ Nothing in a cell's files is run, and no link is followed out of its folder.
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked
 from sdfhub.report.plan import FAILURE, PlannedCell, first_fault, read_plan
 from sdfhub.settings import flat
-
-NOISE = 1e-6
-"""Excess that 30,000 points a side cannot tell from none, normalised units squared."""
 
 ROLES = ("train", "held_out")
 
@@ -27,7 +24,6 @@ TABLE_UNIT = 1e3
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Name = Annotated[str, StringConstraints(max_length=300)]
-Model = TypeVar("Model", bound=BaseModel)
 
 
 class ShapeScore(BaseModel, frozen=True):
@@ -69,10 +65,7 @@ class DistanceScore(BaseModel, frozen=True):
         return {"sdf_error": self.sdf_error * TABLE_UNIT, "sign_accuracy": self.sign_accuracy}
 
 
-class RoleScores(BaseModel, frozen=True):
-    """The judged shapes of a role."""
-
-    shapes: list[ShapeScore | DistanceScore] = []
+RoleScores = list[ShapeScore] | list[DistanceScore]
 
 
 class Training(BaseModel, frozen=True):
@@ -84,35 +77,14 @@ class Training(BaseModel, frozen=True):
     made_with: dict[Name, Name] = {}
 
 
-class Metrics(BaseModel, frozen=True):
-    """What `metrics.json` holds."""
-
-    training: Training
-    train: RoleScores | None = None
-    held_out: RoleScores | None = None
-
-
-class Split(BaseModel, frozen=True):
-    """What reports read of `split.json`."""
-
-    train: list[Name]
-
-
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a finished cell.
+    """The scores of a finished cell."""
 
-    Args:
-        shapes: judged shapes by role.
-        training: its cost.
-        trained_on: training shapes, without augmented copies.
-        config: the content of `config.yaml`.
-    """
-
-    shapes: dict[str, list[ShapeScore | DistanceScore]]
+    shapes: dict[str, RoleScores]  # by role
     training: Training
-    trained_on: int
-    config: dict[str, Any]
+    trained_on: int  # shapes, without augmented copies
+    config: dict[str, Any]  # of config.yaml
 
     def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
@@ -132,21 +104,13 @@ class Scores:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a sweep as it stands.
-
-    Args:
-        plan: what it is.
-        folder: where it lies.
-        state: `failed` also where its files are broken.
-        reason: why there are no scores; empty where there are.
-        scores: None unless `state` is done.
-    """
+    """A cell of a sweep as it stands; `failed` also where its files are broken."""
 
     plan: PlannedCell
     folder: Path
     state: Literal["done", "failed", "missing"]
-    reason: str = ""
-    scores: Scores | None = None
+    reason: str = ""  # why there are no scores
+    scores: Scores | None = None  # of a cell that is done
 
     @property
     def result(self) -> Scores:
@@ -175,7 +139,7 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
             return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
-        return Cell(plan, folder, "done", "", read_scores(folder))
+        return Cell(plan, folder, "done", scores=read_scores(folder))
     except (SdfhubError, OSError) as error:
         return Cell(plan, folder, "failed", str(error))
 
@@ -186,11 +150,14 @@ def read_scores(folder: Path) -> Scores:
     Raises:
         SdfhubError: a file is missing, broken or not what training writes.
     """
-    metrics = _checked(Metrics, _loaded(folder, "metrics.json"), "metrics.json")
-    split = _checked(Split, _loaded(folder, "split.json"), "split.json")
-    roles = {"train": metrics.train, "held_out": metrics.held_out}
-    shapes = {role: scores.shapes for role, scores in roles.items() if scores}
-    return Scores(shapes, metrics.training, len(split.train), _loaded(folder, "config.yaml"))
+    metrics, shapes = _loaded(folder, "metrics.json"), {}
+    for role in filter(metrics.get, ROLES):
+        rows = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}").get("shapes")
+        kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
+        shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
+    training = _checked(Training, metrics.get("training"), "metrics.json: training")
+    trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
+    return Scores(shapes, training, len(trained_on), _loaded(folder, "config.yaml"))
 
 
 def _loaded(folder: Path, name: str) -> dict[str, Any]:
@@ -207,8 +174,8 @@ def _loaded(folder: Path, name: str) -> dict[str, Any]:
     return content
 
 
-def _checked(kind: type[Model], content: dict[str, Any], name: str) -> Model:
+def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
-        return kind.model_validate(content)
+        return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        raise SdfhubError(f"{name}: {first_fault(error)}") from error
+        raise SdfhubError(f"{name}.{first_fault(error)}") from error

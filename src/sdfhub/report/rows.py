@@ -29,18 +29,11 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Row:
-    """A method in a group of comparable cells.
+    """A method in a group of comparable cells, one a seed."""
 
-    Args:
-        method: as the paper writes it: `FFT/SIREN`.
-        normals: `on` or `off`.
-        detail: what else tells the row from others of its method; mostly empty.
-        cells: one a seed.
-    """
-
-    method: str
-    normals: str
-    detail: str
+    method: str  # as the paper writes it: `FFT/SIREN`
+    normals: str  # `on` or `off`
+    detail: str  # what else tells the row from others of its method; mostly empty
     cells: list[Cell]
 
     @property
@@ -67,15 +60,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that may be compared: the same sweep, shapes, scale and way of judging.
+    """Rows that may be compared: the same sweep, shapes, scale and way of judging."""
 
-    Args:
-        judging: options of JUDGING_GROUPS, and values of JUDGING_SETTINGS on the command line.
-        rows: methods in the order of the commands, each with normals first.
-    """
+    judging: dict[str, str]  # options of JUDGING_GROUPS, values of JUDGING_SETTINGS on the command line
+    rows: list[Row]  # in the order of the commands, each with normals first
 
-    judging: dict[str, str]
-    rows: list[Row]
+    @property
+    def first(self) -> Cell | None:
+        """The first finished cell."""
+        return next((row.first for row in self.rows if row.first), None)
 
     @property
     def title(self) -> str:

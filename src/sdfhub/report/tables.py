@@ -34,27 +34,21 @@ ABOUT_DISTANCES = (
     "samples near its surface, then over shapes; signs right: share of samples."
 )
 ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
-ABOUT_COSTS = "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+ABOUT_COSTS = (
+    "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+)
 ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text.
-
-    Args:
-        title: what it shows.
-        frame: of strings; the first column names the row.
-        note: below it.
-        best: row and column of the cells that are the best of their column.
-        prose: whether its cells are words, to be set flush left.
-    """
+    """A table of text."""
 
     title: str
-    frame: pd.DataFrame
+    frame: pd.DataFrame  # of strings; the first column names the row
     note: str = ""
-    best: set[tuple[int, int]] = field(default_factory=set)
-    prose: bool = False
+    best: set[tuple[int, int]] = field(default_factory=set)  # row and column of the best of a column
+    prose: bool = False  # whether cells are words, to be set flush left
 
 
 def tables(group: Group) -> list[Table]:

@@ -15,7 +15,7 @@ from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.opening import data_of
 from sdfhub.report.meshes import FindTruth
 from sdfhub.report.page import page
-from sdfhub.report.pictures import Gallery, Sheet
+from sdfhub.report.pictures import Sheet, contact_sheets, turning_meshes
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
@@ -24,6 +24,9 @@ from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable, write_whole
 
 log = logging.getLogger(__name__)
+
+MESH_BYTES = 4_000_000
+"""Room for the meshes to turn on a page."""
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
@@ -51,9 +54,11 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     write_whole(out / "table.tex", latex(sections))
     write_whole(out / "table.csv", table_csv(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
-    gallery = Gallery(truth_finder())
-    sheets, turning = gallery.sheets(groups, shapes), gallery.turning(groups, shapes)
-    for group, (sheet, _) in zip(groups, sheets, strict=True):
+    find_truth = truth_finder()
+    sheets = contact_sheets(groups, shapes, find_truth)
+    room = MESH_BYTES // max(1, len(groups))
+    turning = [turning_meshes(group, shapes, room, find_truth) for group in groups]
+    for group, sheet in zip(groups, sheets, strict=True):
         write_sheet(sheet, out / f"{sheet_name(group)}.png")
     write_whole(out / "report.html", page(sweep.name, cells, groups, parts, sheets, turning))
     print(f"report: {out / 'report.html'}", flush=True)
@@ -70,7 +75,7 @@ def sheet_name(group: Group) -> str:
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
-    rows = [[tile.instead if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
+    rows = [[tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
     if rows and sheet.columns:
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)

@@ -4,6 +4,7 @@ from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import trimesh
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
@@ -33,25 +34,23 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
     suffix = PurePath(name).suffix.lower()
     if suffix not in FORMATS:
         raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
+    rng = np.random.default_rng(0)
     with TemporaryDirectory() as folder:  # a .gltf can name files of its folder: there are none
         path = Path(folder) / f"scan{suffix}"
         path.write_bytes(content)
         try:
             scan = read_scan(path)
-            seen = observe(scan, space.evidence, "shape", np.random.default_rng(0))
-            code = space.fit_observations([seen.observation]).codes[0]
+            observed = observe(scan, space.evidence, "shape", rng)
+            code = space.fit_observations([observed.observation]).codes[0]
         except (SdfhubError, ValueError) as error:
             reason = str(error).replace(str(path), name)
             raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
-    points = surface_points(scan, np.random.default_rng(0))
-    return code, seen.frame.to_normalized(points).astype(np.float32)
+    return code, observed.frame.to_normalized(surface_points(scan, rng)).astype(np.float32)
 
 
 def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
     """At most POINTS points [M, 3] of a scan's surface, in its frame: all over a mesh, or of a cloud."""
     if scan.faces is None:
         return scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    import trimesh
-
     mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
     return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])

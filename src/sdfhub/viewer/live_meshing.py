@@ -16,19 +16,12 @@ from sdfhub.model.fast.computing import distances
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """A mesh of a code that was asked for.
+    """A mesh of a code that was asked for."""
 
-    Args:
-        about: what was handed over with the code.
-        mesh: normalised frame; empty where the field has no zero level.
-        resolution: points along an axis of its grid.
-        seconds: since it was asked for.
-    """
-
-    about: Any
-    mesh: Mesh
-    resolution: int
-    seconds: float
+    about: Any  # what was handed over with the code
+    mesh: Mesh  # normalised frame; empty where the field has no zero level
+    resolution: int  # points along an axis of its grid
+    seconds: float  # since it was asked for
 
 
 class LiveMesher:
@@ -69,12 +62,12 @@ class LiveMesher:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._latest is not None or not self._is_open)
-                if not self._is_open:
+                self._changed.wait_for(lambda: self._latest or not self._is_open)
+                if not self._is_open or not self._latest:
                     return
-                (code, about, asked), self._latest = self._latest, None
+                latest, self._latest = self._latest, None
             try:
-                self._refine(code, about, asked)
+                self._refine(*latest)
             except _Outdated:
                 pass
             except SdfhubError as error:
@@ -86,7 +79,7 @@ class LiveMesher:
         for index, resolution in enumerate(self.resolutions):
 
             def fields(points: Tensor, shapes: Tensor, is_first: bool = index == 0) -> Tensor:
-                if not is_first and (self._latest is not None or not self._is_open):
+                if not is_first and (self._latest or not self._is_open):
                     raise _Outdated
                 return distances(self.decoder, points, code[None].expand(len(shapes), -1))
 
