@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 class OptunaPruning(L.Callback):
     """Reports a metric to a search's study at each validation; stops the training if the pruner says so.
 
-    What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's sweeper
-    hands no trial on: it is the newest running one with the training's parameters.
+    What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's
+    sweeper hands no trial on: it is the newest running one with the training's parameters.
 
     Args:
         storage: URL of the study's database.

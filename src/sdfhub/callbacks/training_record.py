@@ -1,4 +1,4 @@
-"""Seconds, steps and losses of a training, for `metrics.json`."""
+"""Seconds, steps and last losses of a training, for `metrics.json`."""
 
 import time
 from collections import deque
@@ -12,21 +12,20 @@ from torch import Tensor
 
 from sdfhub.model.autodecoder import AutoDecoder
 
+LAST = 20
+"""Steps whose losses are averaged."""
+
 
 class TrainingRecord(L.Callback):
-    """Seconds, steps and the loss at both ends of a training.
+    """Seconds, steps and the last losses of a training.
 
     The clock starts after the first step of a process, in which loops are compiled. It stands still during
     validation and in `clock_stopped`. What an interrupted training had gathered by its last checkpoint counts
     when the training is continued.
     """
 
-    ENDS = 20
-    """Steps averaged at either end."""
-
     def __init__(self) -> None:
-        self._first: list[float | Tensor] = []  # tensors until a number is needed: a GPU would be waited for
-        self._last: deque[float | Tensor] = deque(maxlen=self.ENDS)
+        self._losses: deque[float | Tensor] = deque(maxlen=LAST)  # tensors: a GPU would be waited for
         self._seconds = 0.0  # up to the last start of the clock, in all processes
         self._started: float | None = None
         self.stepped = False  # by this process
@@ -35,9 +34,7 @@ class TrainingRecord(L.Callback):
         if not self.stepped:
             self.stepped = True
             self.start_clock()
-        self._last.append(outputs["loss"])
-        if len(self._first) < self.ENDS:
-            self._first.append(outputs["loss"])
+        self._losses.append(outputs["loss"])
 
     def start_clock(self) -> None:
         """Counts seconds from now on."""
@@ -63,25 +60,19 @@ class TrainingRecord(L.Callback):
         return self._seconds + (time.perf_counter() - self._started if self._started else 0.0)
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "seconds": self._so_far(),
-            "first": [float(loss) for loss in self._first],
-            "last": [float(loss) for loss in self._last],
-        }
+        return {"seconds": self._so_far(), "last": [float(loss) for loss in self._losses]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._seconds, self._first = state["seconds"], list(state["first"])
-        self._last.extend(state["last"])
+        self._seconds = state["seconds"]
+        self._losses.extend(state["last"])
 
     def summary(self, model: AutoDecoder) -> dict[str, Any]:
-        """Plain numbers: seconds and steps of the whole training, parameters, loss at both ends."""
-        state = self.state_dict()
-        ends = {"start": state["first"], "end": state["last"]}
+        """Plain numbers: seconds and steps of the whole training, parameters, loss at its end."""
         return {
-            "seconds": state["seconds"],
+            "seconds": self._so_far(),
             "steps": model.global_step,
             "parameters": sum(parameter.numel() for parameter in model.decoder.parameters()),
-            "loss": {end: float(np.mean(losses)) for end, losses in ends.items() if losses},
+            "loss": {"end": float(np.mean([float(loss) for loss in self._losses]))} if self._losses else {},
         }
 
 

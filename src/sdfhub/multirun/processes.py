@@ -1,9 +1,5 @@
-"""Processes that train one run together (ddp): none in a multirun, and none outlives another."""
+"""Processes that train one run together (ddp): none in a multirun."""
 
-import logging
-import os
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,8 +12,6 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from sdfhub.errors import SdfhubError
 
 LOST = "another process of this run has died; continue from its last checkpoint"
-
-log = logging.getLogger(__name__)
 
 
 def refuse_processes_in_multirun(trainer: Trainer) -> None:
@@ -32,28 +26,13 @@ def refuse_processes_in_multirun(trainer: Trainer) -> None:
 
 @contextmanager
 def ending_together(trainer: Trainer) -> Iterator[None]:
-    """Ends a process where another of its run has died, and with status 143 after SIGTERM.
-
-    Lightning watches the processes that the first one starts; nobody watches the first one.
-    """
-    if trainer.world_size > 1 and not trainer.is_global_zero:
-        threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    """Ends a process whose run has lost another one with a line, and with status 143 after SIGTERM."""
     try:
         yield
     except SIGTERMException as stop:
         raise SystemExit(143) from stop  # Lightning's has status 0
     except RuntimeError as error:  # gloo raises it bare, NCCL a kind of it
-        if (
-            trainer.world_size == 1
-            or "onnection" not in str(error)
-            and not isinstance(error, torch.distributed.DistError)
-        ):
-            raise
-        raise SdfhubError(LOST) from error
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1)
-    log.error(LOST)
-    os._exit(1)
+        is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
+        if trainer.world_size > 1 and is_loss:
+            raise SdfhubError(LOST) from error
+        raise

@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import fast_simplification
 import numpy as np
@@ -19,7 +19,7 @@ FindTruth = Callable[[Cell, str], StoredShape | None]
 
 
 class ShownMesh(NamedTuple):
-    """A mesh to be looked at, normalised frame: vertices [V, 3] float64, faces [F, 3] int64, what points up."""
+    """A mesh to look at, normalised frame: vertices [V, 3] float64, faces [F, 3] int64, its upward axis."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -52,7 +52,7 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
     return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")
 
 
-def packed(mesh: ShownMesh, triangles: int) -> dict[str, int | str]:
+def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
     """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
 
     Returns:

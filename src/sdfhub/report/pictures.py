@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -48,9 +49,9 @@ def contact_sheets(groups: list[Group], count: int, find_truth: FindTruth) -> li
     sheets = [_sheet(group, count, find_truth) for group in groups]
     tiles = [tile for sheet in sheets for _, row in sheet.rows for tile in row if tile.read]
     readers = [tile.read for tile in tiles]
-    images = stream_in_processes(picture, readers, workers_worth(len(readers), A_WORKERS_WORTH))
-    for tile, tile.image in zip(tiles, images, strict=True):
-        tile.text = "no mesh" if tile.image is None else tile.text
+    images: Any = stream_in_processes(picture, readers, workers_worth(len(readers), A_WORKERS_WORTH))
+    for tile, image in zip(tiles, images, strict=True):
+        tile.image, tile.text = image, "no mesh" if image is None else tile.text
     return sheets
 
 

@@ -1,6 +1,6 @@
 """What a sweep consists of: `sweep.json` in its folder lists the cells, finished or not. Plain data.
 
-A cell is one training. Its folder is named after all its settings, so cells of another scale, category or seed
+A cell is one training. Its folder is named after all its settings: cells of another scale, category or seed
 lie side by side, and a cell whose settings have changed since is superseded, not overwritten.
 """
 
@@ -69,7 +69,7 @@ def first_fault(error: ValidationError) -> str:
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
     """Adds cells to `sweep.json`, and the command that asked for them. Safe side by side.
 
-    A cell whose settings have changed is replaced. Of cells with one folder the one that names fewest settings
+    A cell whose settings have changed is replaced. Of cells with one folder the one with the fewest settings
     stays: the others name defaults.
     """
     sweep.mkdir(parents=True, exist_ok=True)

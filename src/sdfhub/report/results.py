@@ -46,12 +46,6 @@ class ShapeScore(BaseModel, frozen=True):
         """What the Chamfer distance has above its noise floor."""
         return self.counted_cd - self.floor
 
-    def measures(self) -> dict[str, float | None]:
-        """What tables say of the shape, by name; distances times 10^3."""
-        distances = {"cd": self.counted_cd, "floor": self.floor, "excess": self.excess}
-        counts = {"normal_consistency": self.normal_consistency, "no_surface": float(self.failed)}
-        return {name: value * TABLE_UNIT for name, value in distances.items()} | counts
-
 
 class DistanceScore(BaseModel, frozen=True):
     """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
@@ -59,10 +53,6 @@ class DistanceScore(BaseModel, frozen=True):
     id: Name
     sdf_error: Number
     sign_accuracy: Number
-
-    def measures(self) -> dict[str, float | None]:
-        """What tables say of the shape, by name; distances times 10^3."""
-        return {"sdf_error": self.sdf_error * TABLE_UNIT, "sign_accuracy": self.sign_accuracy}
 
 
 RoleScores = list[ShapeScore] | list[DistanceScore]

@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from scipy import stats
 
-from sdfhub.report.results import ROLES, Cell
+from sdfhub.report.results import ROLES, TABLE_UNIT, Cell
 from sdfhub.settings import OF_THE_SEED, deciding
 
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
@@ -21,6 +20,8 @@ JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
 """Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
 
 MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
+PLACES = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
+SCORED = ["cd", "floor", "cd_penalty", "failed", "normal_consistency", "sdf_error", "sign_accuracy"]
 COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 
 NONE = "–"
@@ -77,14 +78,11 @@ class Group:
 
     @property
     def title_parts(self) -> list[str]:
-        """The words of the title: the category, or the name of the user's folder, first."""
-        subject = self.judging.get("category", "all")
-        if self.judging.get("data") == "folder" and "data.source.root" in self.judging:
-            subject = Path(self.judging["data.source.root"]).name
+        """The words of the title, the category first."""
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
         counts = {cell.result.trained_on for row in self.rows for cell in row.done}
         ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
-        return [subject, *parts, f"trained on {ends}"]
+        return [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
@@ -94,14 +92,18 @@ class Group:
         """
         records = [
             vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
-            | {"role": role, "shape": shape.id} | shape.measures()
+            | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
             for role, shapes in cell.result.shapes.items()
             for shape in shapes
         ]  # fmt: skip
-        places = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
-        return pd.DataFrame(records, columns=[*places, *MEASURES]).astype(dict.fromkeys(MEASURES, float))
+        frame = pd.DataFrame(records, columns=[*PLACES, *SCORED]).astype(dict.fromkeys(SCORED, float))
+        has_surface = (frame["failed"] == 0) & frame["cd"].notna()
+        frame["cd"] = frame["cd"].where(has_surface, frame["cd_penalty"])
+        frame["excess"] = frame["cd"] - frame["floor"]
+        frame[["cd", "floor", "excess", "sdf_error"]] *= TABLE_UNIT
+        return frame.rename(columns={"failed": "no_surface"})[[*PLACES, *MEASURES]]
 
     @cached_property
     def statistics(self) -> pd.DataFrame:

@@ -136,7 +136,7 @@ class _Gated(sockets.ServerConnection):
         super().__init__(*arguments, **options)
         self._suffixes = suffixes
 
-    async def recv(self, decode: bool | None = None) -> bytes:
+    async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
         while True:
             if (message := passed(await super().recv(decode=False), self._suffixes)) is not None:
                 return message

@@ -6,6 +6,7 @@ A code is shown: between the shapes A and B, moved along the principal direction
 import html
 import threading
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 import torch
@@ -151,11 +152,11 @@ class Viewer:
         camera = self.server.initial_camera
         camera.position, camera.look_at, camera.fov = *turned_up(EYE_AND_AIM, "z", up), 0.66
         below = turned_up(np.array([[0, 0, -1]]), "z", up)[0]
-        faint = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
+        faint: Any = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
         scene.add_grid("/floor", 8, 8, plane="xy" if up == "z" else "xz", position=below, **faint)
         nothing = np.zeros((3, 3))
         self.mesh = scene.add_mesh_simple("/shape", nothing, np.array([[0, 1, 2]]), color=CLAY, side="double")
-        dots = {"point_size": 0.008, "point_shape": "circle", "visible": False}
+        dots: Any = {"point_size": 0.008, "point_shape": "circle", "visible": False}
         self.scan = scene.add_point_cloud("/scan", nothing, SCAN, **dots)
 
     def _add_controls(self, title: str) -> None:
@@ -165,9 +166,10 @@ class Viewer:
         gui.add_html(f"<style>{STYLE}</style>" + paragraph(title, "title") + paragraph(size, "small"))
         self.name = gui.add_html(paragraph("…", "name"))
         with gui.add_folder("Shape"):
-            self.a = gui.add_dropdown("A", names, hint="What is shown; type to search")
-            self.b = gui.add_dropdown("B", names, initial_value=names[1])
-            self.share = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint="On the line between their codes")
+            self.a: Any = gui.add_dropdown("A", names, hint="What is shown; type to search")
+            self.b: Any = gui.add_dropdown("B", names, initial_value=names[1])
+            hint = "On the line between their codes"
+            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint=hint)
         with gui.add_folder("Principal directions"):
             hint = "Standard deviations of the codes along this axis; 0 is the shape above"
             axes = range(1, len(self.axes) + 1)
