@@ -24,8 +24,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report import pictures
 from sdfhub.report.charts import shape_chart
-from sdfhub.report.meshes import ShownMesh, packed, reconstruction
-from sdfhub.report.pictures import contact_sheets
+from sdfhub.report.pictures import ShownMesh, contact_sheets, packed, reconstruction
 from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import ShapeScore, read_sweep
 from sdfhub.report.rows import group_cells, shapes_csv, table_csv

@@ -14,9 +14,8 @@ from sdfhub.errors import SdfhubError
 from sdfhub.scans.scan import read_scan
 from sdfhub.space import reconstruct
 from sdfhub.tasks import view as view_task
-from sdfhub.viewer.dropped_scan import fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
-from sdfhub.viewer.page import MEAN, Viewer, paragraph
+from sdfhub.viewer.page import MEAN, Viewer, fit_scan, paragraph
 from tests.ball_space import IDS, RADII, write_ball_run
 from tests.tiny import composed
 

@@ -24,28 +24,14 @@ TENSORBOARD_VERTICES = 60_000
 
 @singledispatch
 def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> None:
-    """Shows a picture in a logger.
-
-    Args:
-        logger: one of the trainer's.
-        name: of the picture, the same at every step; parts are separated by "/".
-        image: [H, W, 3] uint8.
-        step: of the training.
-    """
+    """Shows a picture [H, W, 3] uint8 under a name, the same at every step, whose parts "/" separates."""
 
 
 @singledispatch
 def show_mesh(
     logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: UpAxis, step: int
 ) -> None:
-    """Shows a mesh upright in a logger.
-
-    Args:
-        logger, name, step: as for `show_picture`.
-        vertices: [V, 3], normalised frame.
-        faces: [F, 3], F > 0.
-        up: the axis of the mesh that points up.
-    """
+    """Shows a mesh upright: vertices [V, 3] in the normalised frame, faces [F, 3], F > 0, `up` its upward axis."""
 
 
 @show_picture.register

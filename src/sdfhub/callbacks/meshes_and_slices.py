@@ -23,7 +23,7 @@ from sdfhub.space import reconstruct
 METRICS = {"cd": 1e3, "excess": 1e3, "normal_consistency": 1.0, "f_score": 1.0}
 """What `MeshShapes` logs, and the factor of each: Chamfer distances are times 10^3, as in the tables."""
 
-Count = Annotated[int, Field(ge=1)]
+Count, GridSize = Annotated[int, Field(ge=1)], Annotated[int, Field(ge=2)]
 
 
 class ShapesShown(L.Callback):
@@ -31,10 +31,6 @@ class ShapesShown(L.Callback):
 
     The steps depend on the training's length alone, so a continued training shows the same ones. The record
     of the training does not count the seconds spent here. Subclasses write `show`.
-
-    Args:
-        times: how often.
-        shapes: how many, from the front of the code table.
     """
 
     def __init__(self, times: Count = 8, shapes: Count = 2):
@@ -71,16 +67,11 @@ class MeshShapes(ShapesShown):
 
     Args:
         times, shapes: as for `ShapesShown`.
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side of the Chamfer distance.
+        resolution, points: along an axis of the marching-cubes grid; a side of the Chamfer distance.
     """
 
     def __init__(
-        self,
-        times: Count = 8,
-        shapes: Count = 2,
-        resolution: Annotated[int, Field(ge=2)] = 96,
-        points: Count = 10_000,
+        self, times: Count = 8, shapes: Count = 2, resolution: GridSize = 96, points: Count = 10_000
     ):
         super().__init__(times, shapes)
         self.resolution, self.points = resolution, points

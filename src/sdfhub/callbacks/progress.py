@@ -35,10 +35,7 @@ def progress(bar: Literal["tqdm", "rich"] = "tqdm") -> ProgressBar:
 def fitting_callbacks(callbacks: list[L.Callback], loggers: bool, progress_bar: bool) -> list[L.Callback]:
     """The callbacks that a trainer takes: Lightning refuses some where it has nothing for them to do.
 
-    Args:
-        callbacks: all that are configured.
-        loggers: whether the trainer has any; a `LearningRateMonitor` needs one.
-        progress_bar: the trainer's `enable_progress_bar`.
+    A `LearningRateMonitor` needs a logger, a bar the trainer's `enable_progress_bar`.
     """
     dropped = (*([] if loggers else [LearningRateMonitor]), *([] if progress_bar else [ProgressBar]))
     return [callback for callback in callbacks if not isinstance(callback, dropped)]

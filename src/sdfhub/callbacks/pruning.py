@@ -18,11 +18,9 @@ class OptunaPruning(L.Callback):
     sweeper hands no trial on: it is the newest running one with the training's parameters.
 
     Args:
-        storage: URL of the study's database.
-        study: its name there.
+        storage, study: URL of the study's database, and its name there.
         overrides: of this training, `key=value`.
-        pruner: decides; a study does not keep one.
-        monitor: name of the metric, which is minimised.
+        pruner, monitor: what decides, and the name of the metric, which is minimised.
     """
 
     def __init__(

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from sdfhub.model.autodecoder import AutoDecoder
 
-LAST = 20
-"""Steps whose losses are averaged."""
+LAST = 20  # steps whose losses are averaged
 
 
 class TrainingRecord(L.Callback):

@@ -35,11 +35,6 @@ def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, A
 
     A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher.
 
-    Args:
-        train: the training.
-        config: composed, without Hydra's own part.
-        hydra: Hydra's own part.
-
     Returns:
         What `metrics.json` holds; empty for a cell that failed or that another process trains.
     """

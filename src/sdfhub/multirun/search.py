@@ -6,8 +6,7 @@ from typing import Any
 
 from sdfhub.report.results import ROLES, ShapeScore
 
-NOISE = 1e-6
-"""Excess that 30,000 points a side cannot tell from none, normalised units squared."""
+NOISE = 1e-6  # excess that 30,000 points a side cannot tell from none, normalised units squared
 
 
 def objective(metrics: dict[str, Any]) -> float | None:

@@ -10,7 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sdfhub.report.results import ROLES
 from sdfhub.report.rows import Group
+from sdfhub.report.tables import TITLES
 
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -22,6 +24,14 @@ STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, 
 
 KEEP = {"scalars": 0, "images": 1, "audio": 1, "histograms": 1, "tensors": 1}
 """Of each tag in an event file; 0 keeps all."""
+
+
+def charts(group: Group) -> list[tuple[str, str]]:
+    """Caption and SVG, as a data URI, of each chart that there is something to draw in."""
+    pictures = {"Loss of signed distances while training, a line a seed": loss_chart(group)}
+    for role in ROLES:
+        pictures[f"{TITLES[role]}: CD of each, all seeds; the bar is the median"] = shape_chart(group, role)
+    return [(caption, chart) for caption, chart in pictures.items() if chart]
 
 
 @matplotlib.rc_context(STYLE)

@@ -1,30 +1,84 @@
-"""What a page shows of shapes: contact sheets, and meshes to turn."""
+"""What a page shows of shapes: contact sheets, and meshes to turn; truth and reconstructions in one frame."""
 
+import base64
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import fast_simplification
 import numpy as np
+import trimesh
+from PIL import Image
 
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.workers import stream_in_processes, workers_worth
 from sdfhub.geometry.render import render
-from sdfhub.report.meshes import FindTruth, ShownMesh, packed, reconstruction, true_mesh
+from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
 from sdfhub.report.rows import Group
+from sdfhub.shapes import Frame
 
 PIXELS, PAPER = 208, 0.955
 """Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
 
-FEWEST, MOST = 400, 4000
-"""Triangles of a mesh to turn."""
+FEWEST, MOST = 400, 4000  # triangles of a mesh to turn
+TO_TURN = 4  # shapes to turn for each group, at most
+A_WORKERS_WORTH = 32  # meshes for which it pays to start a process that draws them
+FindTruth = Callable[[Cell, str], StoredShape | None]
+"""The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
-TO_TURN = 4
-"""Shapes to turn for each group, at most."""
 
-A_WORKERS_WORTH = 32
-"""Meshes for which it pays to start a process that draws them."""
+class ShownMesh(NamedTuple):
+    """A mesh to look at, normalised frame: vertices [V, 3] float64, faces [F, 3] int64, its upward axis."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    up: UpAxis
+
+
+def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
+    """The true mesh; None where it cannot be had."""
+    mesh = truth.mesh if truth else None
+    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if truth and mesh else None
+
+
+def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
+    """The reconstruction of a shape in a cell's folder; None where there is no surface.
+
+    Where the truth is not there to say what the normalised frame was, the mesh's own extent does.
+    """
+    path = cell / "meshes" / role / f"{score.id}.ply"
+    if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
+        return None
+    try:
+        with path.open("rb") as file:
+            mesh = trimesh.load_mesh(file, file_type="ply", process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
+            return None
+        frame = Frame(truth.center, truth.scale) if truth else Frame.around(vertices)[0]
+    except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
+        return None
+    return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")
+
+
+def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
+    """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
+
+    Returns:
+        `vertices` and `faces`: counts; `data`: positions times 32767 (int16), then indices (uint16).
+    """
+    vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+    if len(faces) > triangles:
+        vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))
+    faces = faces[(faces < 65_535).all(axis=1)]  # many loose triangles do not decimate
+    vertices = turned_up(vertices[:65_535], mesh.up, "z")
+    places = (np.clip(vertices, -1, 1) * 32767).astype("<i2").tobytes()
+    data = base64.b64encode(places + faces.astype("<u2").tobytes()).decode()
+    return {"vertices": len(vertices), "faces": len(faces), "data": data}
 
 
 @dataclass
@@ -117,3 +171,10 @@ def chosen(group: Group, count: int) -> list[tuple[str, str]]:
 def _scores(cell: Cell, role: str) -> dict[str, ShapeScore]:
     """The scores of a role by id; {} where shapes have no surfaces to be judged by."""
     return {s.id: s for s in cell.result.shapes.get(role, []) if isinstance(s, ShapeScore)}
+
+
+def picture_uri(image: np.ndarray) -> str:
+    """A picture as a WebP data URI."""
+    content = io.BytesIO()
+    Image.fromarray(image).save(content, "WEBP", quality=82)
+    return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()

@@ -18,9 +18,7 @@ from sdfhub.settings import flat
 
 ROLES = ("train", "held_out")
 
-TABLE_UNIT = 1e3
-"""Chamfer distances and errors of distances are shown times 10^3."""
-
+TABLE_UNIT = 1e3  # Chamfer distances and errors of distances are shown times 10^3
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Name = Annotated[str, StringConstraints(max_length=300)]

@@ -24,8 +24,7 @@ PLACES = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape
 SCORED = ["cd", "floor", "cd_penalty", "failed", "normal_consistency", "sdf_error", "sign_accuracy"]
 COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 
-NONE = "–"
-"""What tables show where there is nothing."""
+NONE = "–"  # what tables show where there is nothing
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,7 @@ class Group:
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
-        """A line for each judged shape of each finished cell: MEASURES, distances times 10^3.
-
-        The `cd` of a shape without a surface is that of a single point.
-        """
+        """MEASURES of each judged shape, distances times 10^3; `cd` is that of a point where nothing is."""
         records = [
             vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
             | {"role": role, "shape": shape.id} | dict(shape)
@@ -141,10 +137,7 @@ def settings_of(cell: Cell) -> dict[str, str]:
 
 
 def differing(settings: list[dict[str, Any]]) -> dict[str, tuple[str, ...]]:
-    """The keys in which dicts differ, and their values in each.
-
-    Keys of one last name and equal values, such as interpolated ones, are joined by a comma.
-    """
+    """The keys in which dicts differ, and their values; keys of one last name and equal values are joined."""
     joined: dict[tuple, list[str]] = {}
     for key in dict.fromkeys(key for row in settings for key in row):
         values = tuple(str(row.get(key, NONE)) for row in settings)
@@ -233,10 +226,7 @@ def table_csv(groups: list[Group]) -> str:
 
 
 def shapes_csv(groups: list[Group]) -> str:
-    """Every judged shape of every cell as numbers: a line a seed, role and shape; distances times 10^3.
-
-    No `cd` where there is no surface, whose excess counts the CD of a single point.
-    """
+    """Every judged shape of every cell as numbers, distances times 10^3; no `cd` where there is no surface."""
     frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
     frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
     frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)

@@ -1,11 +1,16 @@
 """Task `report`: a sweep's folder becomes tables, pictures and one page that opens offline."""
 
+import base64
 import hashlib
 import logging
 import re
+from datetime import UTC, datetime
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from omegaconf import DictConfig
 
 from sdfhub.data.store.store import Store, preparation_hash
@@ -13,9 +18,8 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.opening import data_of
-from sdfhub.report.meshes import FindTruth
-from sdfhub.report.page import page
-from sdfhub.report.pictures import Sheet, contact_sheets, turning_meshes
+from sdfhub.report.charts import charts
+from sdfhub.report.pictures import FindTruth, Sheet, contact_sheets, picture_uri, turning_meshes
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
@@ -25,8 +29,7 @@ from sdfhub.whole_file import refuse_unwritable, write_whole
 
 log = logging.getLogger(__name__)
 
-MESH_BYTES = 4_000_000
-"""Room for the meshes to turn on a page."""
+MESH_BYTES = 4_000_000  # room for the meshes to turn on a page
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
@@ -38,31 +41,53 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
         shapes: pictured side by side.
 
     Returns:
-        the cells of the sweep.
+        The cells of the sweep.
 
     Raises:
         SdfhubError: not a sweep's folder.
     """
     cells = read_sweep(sweep)
-    groups = group_cells(cells)
-    titles = ["All tables", *(group.title for group in groups), "Origin"]
-    parts = [overview(groups), *map(tables, groups), [origin(read_plan(sweep).commands, cells)]]
-    sections = [(title, part) for title, part in zip(titles, parts, strict=True) if part]
+    groups, find_truth = group_cells(cells), truth_finder()
+    before, after = overview(groups), [origin(read_plan(sweep).commands, cells)]
+    sheets = contact_sheets(groups, shapes, find_truth)
+    parts = [
+        {"title": group.title, "tables": tables(group), "charts": charts(group), "sheet": sheet}
+        | {"turning": turning_meshes(group, shapes, MESH_BYTES // len(groups), find_truth)}
+        for group, sheet in zip(groups, sheets, strict=True)
+    ]
+    sections = [
+        ("All tables", before),
+        *((part["title"], part["tables"]) for part in parts),
+        ("Origin", after),
+    ]
+    sections = [(title, part) for title, part in sections if part]
     text = "\n".join(markdown(title, part) for title, part in sections)
     print(f"\n{text}")
     write_whole(out / "table.md", f"# {sweep.name}\n\n{text}")
     write_whole(out / "table.tex", latex(sections))
     write_whole(out / "table.csv", table_csv(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
-    find_truth = truth_finder()
-    sheets = contact_sheets(groups, shapes, find_truth)
-    room = MESH_BYTES // max(1, len(groups))
-    turning = [turning_meshes(group, shapes, room, find_truth) for group in groups]
     for group, sheet in zip(groups, sheets, strict=True):
         write_sheet(sheet, out / f"{sheet_name(group)}.png")
-    write_whole(out / "report.html", page(sweep.name, cells, groups, parts, sheets, turning))
+    states = [cell.state for cell in cells]
+    counts = [f"{states.count(state)} {state}" for state in ("failed", "missing") if state in states]
+    counts = [f"{states.count('done')} of {len(cells)} cells done", *counts]
+    content = {"overview": before, "parts": parts, "origin": after}
+    write_whole(out / "report.html", page(name=sweep.name, counts=", ".join(counts), **content))
     print(f"report: {out / 'report.html'}", flush=True)
     return cells
+
+
+def page(**content: Any) -> str:
+    """A page that opens offline: text is escaped, and its policy lets no request out."""
+    style, script = (files("sdfhub.report").joinpath(n).read_text("utf-8") for n in ("page.css", "viewer.js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    loader = PackageLoader("sdfhub.report", ".")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+    environment.filters["data_uri"] = picture_uri
+    content |= {"style": Markup(style), "script": Markup(script), "script_hash": Markup(f"sha256-{digest}")}
+    content["written"] = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return environment.get_template("page.html.j2").render(content)
 
 
 def sheet_name(group: Group) -> str:
@@ -76,7 +101,7 @@ def sheet_name(group: Group) -> str:
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
     rows = [[tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
-    if rows and sheet.columns:
+    if sheet.columns:
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
 

@@ -16,12 +16,12 @@ from sdfhub.model.fast.computing import distances
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """A mesh of a code that was asked for."""
+    """A mesh in the normalised frame of a code that was asked for, empty without a surface, `seconds` ago."""
 
     about: Any  # what was handed over with the code
-    mesh: Mesh  # normalised frame; empty where the field has no zero level
+    mesh: Mesh
     resolution: int  # points along an axis of its grid
-    seconds: float  # since it was asked for
+    seconds: float
 
 
 class LiveMesher:

@@ -24,15 +24,11 @@ from websockets.http11 import Request, Response
 from sdfhub.errors import SdfhubError
 
 HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")
-"""What a browser may call this machine."""
-
+NAMES = (HOST, "localhost")  # what a browser may call this machine
 MAX_UPLOAD = 64 << 20
 """Bytes of an uploaded file. A larger one, or one of another type, arrives as an empty one."""
 
-PART = 512 << 10
-"""Bytes of the parts in which viser's page sends a file."""
-
+PART = 512 << 10  # bytes of the parts in which viser's page sends a file
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
     "style-src 'unsafe-inline'; img-src blob: data:; font-src data:; connect-src ws://{host} blob: data:; "
@@ -45,12 +41,7 @@ _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, a
 
 
 class LoopbackServer(viser.ViserServer):
-    """viser behind a gate.
-
-    Args:
-        port: to listen on; 0 takes a free one.
-        label: of the page's panel.
-        suffixes: of files that may be uploaded, in lower case.
+    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one.
 
     Raises:
         SdfhubError: the port is taken.
@@ -94,8 +85,7 @@ def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
 def passed(raw: bytes, suffixes: Collection[str]) -> bytes | None:
     """A page's message as viser shall see it; None where it shall not.
 
-    Values of controls, the camera and the parts of files pass; a file that is too large or of a type that is
-    not one of `suffixes` arrives as an empty one.
+    Values of controls, the camera and parts of files pass; a file too large or of another type arrives empty.
     """
     try:
         message: dict[str, Any] = msgspec.msgpack.decode(raw)

@@ -6,31 +6,33 @@ A code is shown: between the shapes A and B, moved along the principal direction
 import html
 import threading
 from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.up_axis import turned_up
+from sdfhub.scans import scan as scans
+from sdfhub.scans.observed_scan import observe
+from sdfhub.scans.scan import Scan, read_scan
 from sdfhub.space import Space
-from sdfhub.viewer.dropped_scan import FORMATS, fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
 
-DIRECTIONS, REACH = 6, 3.0
-"""Sliders along principal directions, and how far they go, in standard deviations."""
+FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
+"""Meshes and clouds of a whole shape. Archives also carry views and samples, whose frame has to be said."""
 
+POINTS = 4000  # points of a scan's surface that are shown
+DIRECTIONS, REACH = 6, 3.0  # sliders along principal directions, and how far they go, in standard deviations
 RUNGS = (64, 128)
 """Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
 
-FAR = 0.03
-"""Mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves."""
-
-STRANGE = 2.0
-"""Times as unusual as the most unusual of the space's own codes: no shape of its kind."""
-
+FAR = 0.03  # mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves
+STRANGE = 2.0  # times as unusual as the most unusual of the space's own codes: no shape of its kind
 MEAN = "(mean of all shapes)"
 EYE_AND_AIM = np.array([[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]])
 """Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
@@ -40,13 +42,7 @@ STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
 
 class Viewer:
-    """The page and what it does.
-
-    Args:
-        space: whose shapes are shown.
-        title: what the space is called.
-        port: on this machine; 0 takes a free one.
-        resolution: points along an axis of the grid when nothing moves.
+    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves.
 
     Attributes:
         shapes: codes [L] by the names under which the page offers them.
@@ -186,6 +182,39 @@ class Viewer:
         reset.on_click(lambda _: self.reset())
         self.overlay.on_update(lambda _: self._show_scan())
         upload.on_upload(lambda _: self.fit(upload.value.name, upload.value.content))
+
+
+def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
+    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame.
+
+    The file's name is for messages and its suffix; nothing is opened under it.
+
+    Raises:
+        SdfhubError: names the file and what is wrong with it.
+    """
+    suffix = PurePath(name).suffix.lower()
+    if suffix not in FORMATS:
+        raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
+    rng = np.random.default_rng(0)
+    with TemporaryDirectory() as folder:  # a .gltf can name files of its folder: there are none
+        path = Path(folder) / f"scan{suffix}"
+        path.write_bytes(content)
+        try:
+            scan = read_scan(path)
+            observed = observe(scan, space.evidence, "shape", rng)
+            code = space.fit_observations([observed.observation]).codes[0]
+        except (SdfhubError, ValueError) as error:
+            reason = str(error).replace(str(path), name)
+            raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
+    return code, observed.frame.to_normalized(surface_points(scan, rng)).astype(np.float32)
+
+
+def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
+    """At most POINTS points [M, 3] of a scan's surface, in its frame: all over a mesh, or of a cloud."""
+    if scan.faces is None:
+        return scan.points[rng.permutation(len(scan.points))[:POINTS]]
+    mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])
 
 
 def bounded(value: float, low: float, high: float) -> float:
