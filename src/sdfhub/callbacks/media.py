@@ -31,7 +31,7 @@ def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> Non
 def show_mesh(
     logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: UpAxis, step: int
 ) -> None:
-    """Shows a mesh upright: vertices [V, 3] in the normalised frame, faces [F, 3], F > 0, `up` its upward axis."""
+    """Shows a mesh upright: vertices [V, 3], normalised frame, faces [F, 3], F > 0, its upward axis."""
 
 
 @show_picture.register

@@ -23,7 +23,8 @@ from sdfhub.space import reconstruct
 METRICS = {"cd": 1e3, "excess": 1e3, "normal_consistency": 1.0, "f_score": 1.0}
 """What `MeshShapes` logs, and the factor of each: Chamfer distances are times 10^3, as in the tables."""
 
-Count, GridSize = Annotated[int, Field(ge=1)], Annotated[int, Field(ge=2)]
+Count = Annotated[int, Field(ge=1)]
+GridSize = Annotated[int, Field(ge=2)]
 
 
 class ShapesShown(L.Callback):

@@ -226,7 +226,7 @@ def table_csv(groups: list[Group]) -> str:
 
 
 def shapes_csv(groups: list[Group]) -> str:
-    """Every judged shape of every cell as numbers, distances times 10^3; no `cd` where there is no surface."""
+    """Every judged shape of every cell as numbers, distances times 10^3; no `cd` without a surface."""
     frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
     frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
     frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)

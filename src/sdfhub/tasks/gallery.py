@@ -39,7 +39,7 @@ def write_gallery(
     for stale in (out / "meshes").glob("[0-9][0-9][0-9].ply"):  # of a longer row
         stale.unlink()
     for index, mesh in enumerate(meshes):
-        write_mesh(*mesh, out / "meshes" / f"{index:03d}.ply")
+        write_mesh(mesh.vertices, mesh.faces, out / "meshes" / f"{index:03d}.ply")
     write_row(meshes, space.up, out / "meshes.glb")
     if animated:
         animation(pictures, out / "animation.gif")

@@ -23,7 +23,7 @@ from sdfhub.report.pictures import FindTruth, Sheet, contact_sheets, picture_uri
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
-from sdfhub.report.tables import latex, markdown, origin, overview, tables
+from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
 from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable, write_whole
 
@@ -50,17 +50,13 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     groups, find_truth = group_cells(cells), truth_finder()
     before, after = overview(groups), [origin(read_plan(sweep).commands, cells)]
     sheets = contact_sheets(groups, shapes, find_truth)
-    parts = [
+    parts: list[dict[str, Any]] = [
         {"title": group.title, "tables": tables(group), "charts": charts(group), "sheet": sheet}
         | {"turning": turning_meshes(group, shapes, MESH_BYTES // len(groups), find_truth)}
         for group, sheet in zip(groups, sheets, strict=True)
     ]
-    sections = [
-        ("All tables", before),
-        *((part["title"], part["tables"]) for part in parts),
-        ("Origin", after),
-    ]
-    sections = [(title, part) for title, part in sections if part]
+    sections: list[tuple[str, list[Table]]] = [("All tables", before)] if before else []
+    sections += [*((part["title"], part["tables"]) for part in parts), ("Origin", after)]
     text = "\n".join(markdown(title, part) for title, part in sections)
     print(f"\n{text}")
     write_whole(out / "table.md", f"# {sweep.name}\n\n{text}")
