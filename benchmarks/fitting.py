@@ -16,102 +16,97 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
-from runs import ROOT, at_least, run_benchmark, train
+from runs import OUTPUTS, head, row, train
 
 import sdfhub
 from sdfhub.data.loading.batches import signed_samples
 from sdfhub.data.splits import split
+from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.metrics import judge
-from sdfhub.model.decoder import Decoder
+from sdfhub.latent.deepsdf_fit import DeepSdfFit
+from sdfhub.latent.fitting import Fit
+from sdfhub.latent.gauss_newton import GaussNewtonFit
 from sdfhub.model.losses import clamped_l1
-from sdfhub.space import reconstruct
-from sdfhub.tasks.build import build
-from sdfhub.tasks.evaluate import Evaluation, fit_held_out
-from sdfhub.tasks.run import read_run
+from sdfhub.opening import data_of, read_run
+from sdfhub.scans.observed_scan import observations_of
 
 FRESH = 40_000
 """Samples of a shape on which its objective is measured, drawn apart from those of the fits."""
 
 
-def unseen_shapes(space: Path, count: int) -> list[StoredShape]:
-    """Shapes of the space's source that it was not trained on, prepared as its own were."""
-    config, roles = read_run(space)
-    data = build(config["data"] | {"workers": 1}, "data", within="sdfhub.data")
+def unseen_shapes(run: Path, count: int) -> list[StoredShape]:
+    """Shapes of the run's source that it was not trained on, prepared as its own were."""
+    config, roles = read_run(run)
+    data = data_of(config)
     others = [shape for shape in data.source.shapes() if shape.id not in roles["train"]]
-    return list(data.filled(split(others, 0, count, seed=1)))
+    return list(data.filled(split(others, 0, count, seed=1)).values())
 
 
-def evaluation(fit: str, together: int, seed: int) -> Evaluation:
-    node = yaml.safe_load((ROOT / "conf" / "fit" / f"{fit}.yaml").read_text())
-    return Evaluation(128, 30_000, None, None, build(node, "fit"), together, 0, seed=seed)
-
-
-def timed(decoder: Decoder, shapes: list[StoredShape], how: Evaluation) -> tuple[torch.Tensor, float]:
+def timed(
+    space: sdfhub.Space, shapes: list[StoredShape], fit: Fit, seed: int = 0
+) -> tuple[torch.Tensor, float]:
+    """Codes [S, L] and processor seconds."""
     start = time.process_time()
-    return fit_held_out(decoder, shapes, how), time.process_time() - start
+    observations = observations_of(shapes, fit.samples, [shape_seed(shape) ^ seed for shape in shapes])
+    codes = fit(space.decoder, space.codes, observations, space.delta).codes
+    return codes, time.process_time() - start
 
 
 @torch.no_grad()
-def quality(decoder: Decoder, shape: StoredShape, code: torch.Tensor) -> tuple[float, float]:
+def quality(space: sdfhub.Space, shape: StoredShape, code: torch.Tensor) -> tuple[float, float]:
     """Objective on fresh samples, and CD of the reconstruction."""
     rows = torch.from_numpy(signed_samples(shape, FRESH, np.random.default_rng(2**40)))[None]
-    field = decoder(rows[..., :3], code[None])
-    objective = clamped_l1(field, rows[..., 3], 0.1) + 1e-4 * code.square().mean()
-    cd = judge(*reconstruct(decoder, code[None], 128), shape.mesh).cd
+    field = space.decoder(rows[..., :3], code[None])
+    objective = clamped_l1(field, rows[..., 3], space.delta) + 1e-4 * code.square().mean()
+    cd = judge(space.mesh(code, 128), shape.mesh).cd
     return float(objective) * 1e3, np.nan if cd is None else cd * 1e3
 
 
-def compare(decoder: Decoder, shapes: list[StoredShape], reference: int) -> None:
-    quick, seconds = [], 0.0
+def compare(space: sdfhub.Space, shapes: list[StoredShape], reference: int) -> None:
+    quick, seconds = [], []
     for seed in (0, 1):
-        codes, spent = timed(decoder, shapes, evaluation("gauss_newton", len(shapes), seed))
-        quick.append(np.array([quality(decoder, *pair) for pair in zip(shapes, codes, strict=True)]))
-        seconds += spent / 2 / len(shapes)
-        line = f"gauss_newton, seed {seed}: {spent / len(shapes):.2f} s a shape; objective, CD median "
+        codes, spent = timed(space, shapes, GaussNewtonFit(seed=seed), seed)
+        quick.append(np.array([quality(space, *pair) for pair in zip(shapes, codes, strict=True)]))
+        seconds.append(spent / len(shapes))
+        line = f"gauss_newton, seed {seed}: {seconds[-1]:.2f} s a shape; objective, CD median "
         print(line + str(np.nanmedian(quick[-1], axis=0).round(4)), flush=True)
     slow, times = [], []
-    print("\n| shape | deepsdf s | objective | CD | gauss_newton objective | CD |\n" + "| --- " * 6 + "|")
+    head("shape | deepsdf s | objective | CD | gauss_newton objective | CD")
     for index, shape in enumerate(shapes[:reference]):
-        code, spent = timed(decoder, [shape], evaluation("deepsdf", 1, 0))
+        code, spent = timed(space, [shape], DeepSdfFit())
         times.append(spent)
-        slow.append(quality(decoder, shape, code[0]))
-        cells = [f"{value:.4f}" for value in (*slow[-1], *quick[0][index])]
-        print(f"| {shape.id} | {spent:.1f} | {' | '.join(cells)} |", flush=True)
-    report(quick, np.array(slow), np.mean(times) / seconds)
+        slow.append(quality(space, shape, code[0]))
+        row(shape.id, f"{spent:.1f}", *(f"{value:.4f}" for value in (*slow[-1], *quick[0][index])))
+    if slow:
+        report(quick, np.array(slow), np.mean(times) / np.mean(seconds))
 
 
 def report(quick: list[np.ndarray], slow: np.ndarray, ratio: float) -> None:
-    count = len(slow)
-    print(f"\nseconds a shape: deepsdf / gauss_newton = {ratio:.1f}\n")
-    print("| | deepsdf mean | median | gauss_newton mean | median | difference, median of shapes | noise |")
-    print("| --- " * 7 + "|")
+    print(f"\nseconds a shape: deepsdf / gauss_newton = {ratio:.1f}")
+    head(" | deepsdf mean | median | gauss_newton mean | median | difference, median of shapes | noise")
     for column, name in enumerate(("objective", "CD")):
-        ours, theirs = quick[0][:count, column], slow[:, column]
+        ours, theirs = quick[0][: len(slow), column], slow[:, column]
         values = [np.nanmean(theirs), np.nanmedian(theirs), np.nanmean(ours), np.nanmedian(ours)]
-        noise = np.nanmedian(np.abs(quick[0] - quick[1])[:, column])
-        values += [np.nanmedian(ours - theirs), noise]
-        print(f"| {name} | " + " | ".join(f"{value:.4f}" for value in values) + " |")
+        values += [np.nanmedian(ours - theirs), np.nanmedian(np.abs(quick[0] - quick[1])[:, column])]
+        row(name, *(f"{value:.4f}" for value in values))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--space", type=Path, help="folder of a trained run")
     parser.add_argument("--experiment", default="fft_siren", help="what to train where no run is given")
-    parser.add_argument("--shapes", type=at_least(1), default=32)
-    parser.add_argument("--reference", type=at_least(0), default=4, help="of these also by DeepSDF's recipe")
+    parser.add_argument("--shapes", type=int, default=32)
+    parser.add_argument("--reference", type=int, default=4, help="of these also by DeepSDF's recipe")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    if (space := arguments.space) is None:
-        name = f"fitting_{arguments.experiment}"
+    run = arguments.space
+    if run is None:
+        run = OUTPUTS / f"fitting_{arguments.experiment}"
         settings = ["scale=cpu_200", "callbacks=none", "evaluate.train=1", "evaluate.held_out=0"]
-        train(name, f"experiment={arguments.experiment}", *settings)
-        space = ROOT / "outputs" / "benchmarks" / name
-    compare(
-        sdfhub.load(space, device="cpu").decoder, unseen_shapes(space, arguments.shapes), arguments.reference
-    )
+        train(run.name, f"experiment={arguments.experiment}", *settings)
+    compare(sdfhub.load(run, "cpu"), unseen_shapes(run, arguments.shapes), arguments.reference)
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -31,10 +31,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from runs import at_least, run_benchmark
+from runs import OUTPUTS, ROOT, head, row
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
+from sdfhub.data.loading.batches import Loading, StepBatches
 from sdfhub.data.preparation.sampling import Preparation
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import split
@@ -42,8 +42,7 @@ from sdfhub.data.store import store, stored_shape
 from sdfhub.data.store.store import Store
 from sdfhub.model.fast.computing import keep_freed_memory
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / "outputs" / "benchmarks" / "growth"
+FOLDER = OUTPUTS / "growth"
 COUNTS = (10, 100, 1000)
 PER_STEP, SAMPLES, SURFACE = 10, 512, 64
 PAPER_STEP = 64, 16_384, 4096
@@ -68,7 +67,7 @@ def filled_store(real: int) -> Store:
     """The store of as many tables as the largest count, `real` of them prepared, the others copied."""
     source, preparation = ProceduralSource({"tables": {}}, count=COUNTS[-1]), Preparation()
     shapes = split(source.shapes(), train=None, held_out=0, seed=0).train
-    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store"))
+    prepared = list(store.prepare(source, shapes[:real], preparation, FOLDER / "store").values())
     folder = FOLDER / "store" / source.name / store.preparation_hash(preparation)
     for index, shape in enumerate(shapes[real:]):
         path = folder / f"{shape.id}{stored_shape.SUFFIX}"
@@ -91,6 +90,7 @@ def trained(shapes: int, steps: int) -> Growth:
         *("category=tables", f"data.shapes={shapes}", "data.held_out=0", f"data.store={FOLDER / 'store'}"),
         *(f"data.loader.shapes_per_step={PER_STEP}", f"data.loader.samples_per_shape={SAMPLES}"),
         *(f"data.loader.surface_per_shape={SURFACE}", "callbacks=none", "evaluate.train=0"),
+        "++trainer.limit_val_batches=0",
         *("trainer=cpu", "trainer.max_epochs=1", "trainer.log_every_n_steps=1"),
         *(f"data.loader.passes_per_epoch={steps * PER_STEP // shapes}", f"hydra.run.dir={run}"),
     ]
@@ -133,8 +133,7 @@ def draw_times(shapes: Store, *sizes: int) -> tuple[float, float]:
         sizes: shapes a step, samples and surface points of each.
     """
     keep_freed_memory()  # as training does
-    loading = Loading(*sizes, 1, workers=0, augmentation=Augmentation(), seed=0)
-    batches = StepBatches(list(shapes), loading)
+    batches = StepBatches(list(shapes.values()), Loading(*sizes))
     seconds = []
     for step in range(2 * len(batches)):
         start = time.perf_counter()
@@ -155,16 +154,12 @@ def copy_rate() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--rounds", type=at_least(1), default=3)
-    parser.add_argument("--steps", type=at_least(100), default=100, help="a multiple of 100")
-    parser.add_argument(
-        "--real", type=at_least(1), default=20, help="shapes to prepare; the others are copies"
-    )
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=100, help="a multiple of 100")
+    parser.add_argument("--real", type=int, default=20, help="shapes to prepare; the others are copies")
     parser.add_argument("--keep", action="store_true", help="leave the store for the next time")
     arguments = parser.parse_args()
-    if arguments.steps % 100:
-        parser.error(f"--steps {arguments.steps}: must be a multiple of 100")
     shapes = filled_store(arguments.real)
     try:
         report(shapes, arguments)
@@ -176,38 +171,30 @@ def main() -> None:
 def report(shapes: Store, arguments: argparse.Namespace) -> None:
     """Measures and prints."""
     trained(COUNTS[0], arguments.steps)  # compiles what is compiled once and kept
-    found, alone = {shapes: [] for shapes in COUNTS}, []
+    found, alone = {count: [] for count in COUNTS}, []
     for _ in range(arguments.rounds):
         alone.append(imports())
         for count in COUNTS:
             found[count].append(trained(count, arguments.steps))
-    size = sum(file.stat().st_size for file in shapes.folder.rglob("*.npy"))
-    prepared = min(arguments.real, len(shapes))
-    print(f"Store: {len(shapes)} shapes, {size / 1e9:.1f} GB; {prepared} prepared, the others copies.\n")
-    print("| shapes | start-up s | of the processor | samples/s | memory GB | codes MB | checkpoint MB |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    size = sum(shape.path.stat().st_size for shape in shapes.values())
+    print(f"Store: {len(shapes)} shapes, {size / 1e9:.1f} GB; {arguments.real} prepared, the others copies.")
+    head("shapes | start-up s | of the processor | samples/s | memory GB | codes MB | checkpoint MB")
     for count, runs in found.items():
         middle = {name: statistics.median(getattr(run, name) for run in runs) for name in vars(runs[0])}
-        print(
-            f"| {count} | {middle['start_up']:.2f} | {middle['processor']:.2f} | {middle['speed']:,.0f} "
-            f"| {middle['memory'] / 1e9:.3f} | {middle['codes'] / 1e6:.3f} "
-            f"| {middle['checkpoint'] / 1e6:.2f} |"
-        )
+        cells = f"{middle['start_up']:.2f}", f"{middle['processor']:.2f}", f"{middle['speed']:,.0f}"
+        sizes = f"{middle['memory'] / 1e9:.3f}", f"{middle['codes'] / 1e6:.3f}"
+        row(count, *cells, *sizes, f"{middle['checkpoint'] / 1e6:.2f}")
     first, later = draw_times(shapes, PER_STEP, SAMPLES, SURFACE)
     step = statistics.median(PER_STEP * SAMPLES / run.speed for run in found[COUNTS[-1]])
-    clock, processor = (statistics.median(each) for each in zip(*alone, strict=True))
+    clock, processor = (statistics.median(column) for column in zip(*alone, strict=True))
     print(f"\nImporting torch and lightning alone: {clock:.2f} s, {processor:.2f} s of the processor.")
-    print(
-        f"Drawing a batch from {len(shapes)} shapes: {first * 1e3:.2f} ms when they are first seen, "
-        f"{later * 1e3:.2f} ms later, of a step's {step * 1e3:.1f} ms."
-    )
+    when = f"{first * 1e3:.2f} ms when they are first seen, {later * 1e3:.2f} ms later"
+    print(f"Drawing a batch from {len(shapes)} shapes: {when}, of a step's {step * 1e3:.1f} ms.")
     _, seconds = draw_times(shapes, *PAPER_STEP)
     rate = PAPER_STEP[0] * (PAPER_STEP[1] * 16 + PAPER_STEP[2] * 24) / seconds
-    print(
-        f"Drawing a batch of the paper's: {seconds * 1e3:.1f} ms, {rate / 1e9:.2f} GB/s, "
-        f"{rate / copy_rate():.2f} of the rate of a copy."
-    )
+    share = f"{rate / 1e9:.2f} GB/s, {rate / copy_rate():.2f} of the rate of a copy"
+    print(f"Drawing a batch of the paper's: {seconds * 1e3:.1f} ms, {share}.")
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -15,10 +15,9 @@ for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):
     os.environ[name] = "1"
 
 import numpy as np  # noqa: E402
-from runs import at_least, run_benchmark  # noqa: E402
+from runs import head, row  # noqa: E402
 
-from sdfhub.data.preparation.sampling import prepare_mesh  # noqa: E402
-from sdfhub.data.preparation.settings import Preparation  # noqa: E402
+from sdfhub.data.preparation.sampling import Preparation, prepare_mesh  # noqa: E402
 
 SIDE = 1000
 """Rings and meridians of the sphere: twice its square are its faces."""
@@ -43,7 +42,7 @@ def bumpy_sphere(side: int = SIDE, radius: float = 1.0) -> tuple[np.ndarray, np.
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hidden", action="store_true", help="put the faces where no view sees them")
-    parser.add_argument("--samples", type=at_least(2), default=500_000)
+    parser.add_argument("--samples", type=int, default=500_000)
     args = parser.parse_args()
     vertices, faces = bumpy_sphere()
     if args.hidden:
@@ -54,11 +53,11 @@ def main() -> None:
     samples = prepare_mesh((vertices, faces), Preparation(samples=args.samples))
     seconds = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print("| faces | kept | s of processor | samples/s | peak GB | before preparing GB |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    cells = f"{len(faces):,} | {len(samples.mesh.faces):,} | {seconds:.0f} | {args.samples / seconds:,.0f}"
-    print(f"| {cells} | {peak / 2**20:.2f} | {memory / 2**20:.2f} |")
+    head("faces | kept | s of processor | samples/s | peak GB | before preparing GB")
+    counts = f"{len(faces):,}", f"{len(samples.mesh.faces):,}"
+    speed = f"{seconds:.0f}", f"{args.samples / seconds:,.0f}"
+    row(*counts, *speed, f"{peak / 2**20:.2f}", f"{memory / 2**20:.2f}")
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -23,14 +23,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from runs import ROOT, at_least, run_benchmark, train
+from runs import OUTPUTS, head, row, train
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields
+from sdfhub.geometry.mesher import mesh_dense, mesh_field
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks.run import build_autodecoder, put_weights, read_run, read_weights
+from sdfhub.model.saved import built_parts
 
 TOLERANCE = 1e-6
 SMALL = [
@@ -54,9 +54,9 @@ class Measured:
     def __init__(self, field):
         self.field, self.points, self.seconds = field, 0, 0.0
 
-    def __call__(self, points: torch.Tensor, *shapes: torch.Tensor) -> torch.Tensor:
+    def __call__(self, points: torch.Tensor) -> torch.Tensor:
         start = time.process_time()
-        values = self.field(points, *shapes)
+        values = self.field(points)
         self.seconds += time.process_time() - start
         self.points += values.numel()
         return values
@@ -65,19 +65,13 @@ class Measured:
 def space(name: str, shapes: int) -> AutoDecoder:
     """The trained model of a space, trained first if it is not there yet; `untrained` needs no training."""
     if name == "untrained":
-        space("chairs", shapes)  # for its settings
-        config, _ = read_run(folder("chairs", shapes))
-        return shifted(build_autodecoder(config, shapes).eval())
-    last = folder(name, shapes) / "checkpoints" / "last.ckpt"
-    if not (folder(name, shapes) / "metrics.json").exists():
-        train(folder(name, shapes).name, *SMALL, *SPACES[name], f"data.shapes={shapes}")
-    model = build_autodecoder(read_run(folder(name, shapes))[0], shapes)
-    put_weights(model, read_weights(last), last)
-    return model.eval()
-
-
-def folder(name: str, shapes: int) -> Path:
-    return ROOT / "outputs" / "benchmarks" / f"meshing_{name}_{shapes}"
+        trained = space("chairs", shapes)
+        torch.manual_seed(0)
+        return shifted(AutoDecoder(**built_parts(trained.hparams, Path(name))).eval())
+    run = OUTPUTS / f"meshing_{name}_{shapes}"
+    if not (run / "metrics.json").exists():
+        train(run.name, *SMALL, *SPACES[name], f"data.shapes={shapes}")
+    return AutoDecoder.load_from_checkpoint(run / "checkpoints" / "last.ckpt").eval()
 
 
 @torch.no_grad()
@@ -117,8 +111,8 @@ def pieces(faces: np.ndarray, lacking: np.ndarray) -> int:
     return len(np.unique(connected_components(graph)[1][lacking]))
 
 
-def compared(name: str, model: AutoDecoder, resolution: int, shapes: int) -> str:
-    """A line of the first table."""
+def compared(name: str, model: AutoDecoder, resolution: int, shapes: int) -> None:
+    """Prints a line of the first table."""
     rows = []
     for shape in range(shapes):
         field = field_of(model, shape)
@@ -126,12 +120,12 @@ def compared(name: str, model: AutoDecoder, resolution: int, shapes: int) -> str
         field.points = 0
         rows.append((*compare(mesh_field(field, resolution), want), resolution**3 / field.points))
     apart, missed, same, fewer = map(np.array, zip(*rows, strict=True))
-    cells = f"{resolution}^3 | {shapes} | {sum(missed)} | {apart.max():.1e} | {same.sum()} of {shapes}"
-    return f"| {name} | {cells} | {fewer.min():.1f} | {np.median(fewer):.1f} |"
+    cells = f"{apart.max():.1e}", f"{same.sum()} of {shapes}", f"{fewer.min():.1f}", f"{np.median(fewer):.1f}"
+    row(name, f"{resolution}^3", shapes, sum(missed), *cells)
 
 
-def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes: int) -> str:
-    """A line of the second table."""
+def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes: int) -> None:
+    """Prints a line of the second table."""
     dense_seconds, seconds, share, fewer = [], [], [], []
     for shape in range(shapes):
         if shape < dense:
@@ -143,23 +137,7 @@ def measured(name: str, model: AutoDecoder, resolution: int, dense: int, shapes:
     ratio = min(dense_seconds) / np.array(seconds)
     cells = [f"{min(dense_seconds):.1f}", f"{np.median(seconds):.2f}", f"{ratio.min():.1f}"]
     cells += [f"{np.median(ratio):.1f}", f"{min(fewer):.1f}", f"{np.median(fewer):.1f}"]
-    return f"| {name} | {shapes} | {' | '.join(cells)} | {np.median(share):.0%} |"
-
-
-def together(model: AutoDecoder, resolution: int, shapes: int) -> str:
-    """Meshing shapes together against one after another, in turns: a line."""
-    codes, best = model.codes.table.detach(), [np.inf, np.inf]
-    for _ in range(2):
-        _, one = timed(lambda: [mesh_field(field_of(model, row), resolution) for row in range(shapes)])
-        fields = Measured(lambda points, rows: model.decoder(points, codes[rows]))
-        _, many = timed(lambda fields=fields: list(mesh_fields(fields, shapes, resolution)))
-        best = [min(best[0], one), min(best[1], many)]
-    return f"{shapes} shapes at {resolution}^3 together: {best[0] / best[1]:.2f} x as fast as one by one"
-
-
-def head(columns: str) -> str:
-    names = columns.split(", ")
-    return f"\n| {' | '.join(names)} |\n|{' --- |' * len(names)}"
+    row(name, shapes, *cells, f"{np.median(share):.0%}")
 
 
 def peak_memory(name: str, shapes: int) -> None:
@@ -180,11 +158,9 @@ def main() -> None:
     names = [*SPACES, "untrained"]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--whole", action="store_true", help="100 shapes a space")
-    parser.add_argument("--shapes", type=at_least(1), help="a space, all compared and timed")
-    parser.add_argument("--compare", type=at_least(2), default=96, help="resolution of the comparison")
-    parser.add_argument(
-        "--dense", type=at_least(1), default=1, help="shapes whose dense mesh is timed, at 256^3"
-    )
+    parser.add_argument("--shapes", type=int, help="a space, all compared and timed")
+    parser.add_argument("--compare", type=int, default=96, help="resolution of the comparison")
+    parser.add_argument("--dense", type=int, default=1, help="shapes whose dense mesh is timed, at 256^3")
     parser.add_argument("--spaces", nargs="+", choices=names, default=names)
     parser.add_argument("--only", choices=("compared", "measured"))
     parser.add_argument("--peak", help=argparse.SUPPRESS)
@@ -194,23 +170,17 @@ def main() -> None:
     if arguments.peak:
         return peak_memory(arguments.peak, shapes)
     models = {name: space(name, shapes) for name in arguments.spaces}
+    fewer = "fewer evaluations min | median"
     if arguments.only != "measured":
-        print(
-            head(
-                "space, grid, shapes, pieces missed, vertices apart, same mesh, fewer evaluations min, median"
-            )
-        )
+        head(f"space | grid | shapes | pieces missed | vertices apart | same mesh | {fewer}")
         for name, model in models.items():
-            some = shapes if name in CATEGORIES else min(shapes, ROUGH)
-            print(compared(name, model, arguments.compare, some), flush=True)
+            compared(name, model, arguments.compare, shapes if name in CATEGORIES else min(shapes, ROUGH))
     if arguments.only != "compared":
-        timings = "shapes, dense s, ours s, ratio min, median, fewer evaluations min, median"
-        print(head(f"space, {timings}, time in the field"))
+        head(f"space | shapes | dense s | ours s | ratio min | median | {fewer} | time in the field")
         for name in [name for name in CATEGORIES if name in models]:
-            print(measured(name, models[name], 256, arguments.dense, shapes), flush=True)
-        first = min(models)
-        print(f"\n{together(models[first], 64, 4)}\n{peak_elsewhere(first, shapes)}")
+            measured(name, models[name], 256, arguments.dense, shapes)
+        print(f"\n{peak_elsewhere(min(models), shapes)}")
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -1,4 +1,4 @@
-"""Whether what is wrong about trained shapes is their mirror image: of a symmetric family, some shapes are not.
+"""Whether what is wrong about training shapes is their mirror image: not all of a symmetric family are.
 
     python benchmarks/mirrors.py RUN ...
 
@@ -12,10 +12,10 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from runs import head, row
 from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
-from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.report.pictures import reconstruction
 from sdfhub.report.plan import PlannedCell
@@ -30,24 +30,17 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     truth = truth_finder()
     for run in map(Path.resolve, parser.parse_args().runs):
-        try:
-            plan = PlannedCell(folder=run.name, choices={}, settings={}, seed=0)
-            cell = Cell(plan, run, "done", "", read_scores(run))
-        except SdfhubError as error:
-            parser.error(f"{run}: {error}")
-        rows = [row for score in cell.scores.shapes.get("train", []) if (row := judged(cell, score, truth))]
-        if not rows:
-            parser.error(f"{run}: the prepared shapes that it was trained on are not here")
-        rows.sort(key=lambda row: -row[1])
-        print(f"\n### {run.name}\n")
-        print("| shape | excess | differs across x | across the other | strays | of these mirrored |")
-        print("| --- | --- | --- | --- | --- | --- |")
-        for id, *numbers in rows:
-            excess, across, other, strays, mirrored = numbers
-            told = f"{mirrored:.2f}" if strays else ""
-            print(f"| {id} | {excess:.4f} | {across:.2f} | {other:.2f} | {strays:.3f} | {told} |")
-        columns = np.array([row[1:4] for row in rows]).T
-        ranks = [spearmanr(columns[0], column).statistic for column in columns[1:]]
+        plan = PlannedCell(folder=run.name, choices={}, settings={}, seed=0)
+        cell = Cell(plan, run, "done", "", read_scores(run))
+        found = [found for score in cell.scores.shapes["train"] if (found := judged(cell, score, truth))]
+        found.sort(key=lambda shape: -shape[1])
+        print(f"\n### {run.name}")
+        head("shape | excess | differs across x | across the other | strays | of these mirrored")
+        for id, excess, across, other, strays, mirrored in found:
+            of_these = f"{mirrored:.2f}" if strays else ""
+            row(id, f"{excess:.4f}", f"{across:.2f}", f"{other:.2f}", f"{strays:.3f}", of_these)
+        excesses, *columns = np.array([shape[1:4] for shape in found]).T
+        ranks = [spearmanr(excesses, column).statistic for column in columns]
         print(f"\nrank correlation of excess: across x {ranks[0]:.2f}, across the other {ranks[1]:.2f}")
 
 

@@ -7,8 +7,6 @@ double backward, and the whole batch is one piece on PyTorch's own threads. Data
 judging stay sdfhub's. `accuracy.py` runs it beside `train.py`; a test holds the two objectives equal.
 """
 
-from runs import run_benchmark
-
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
@@ -25,7 +23,7 @@ from sdfhub.model.conditioning import Concat
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.pieces import Parts
 from sdfhub.shapes import Batch
-from sdfhub.tasks.train import main as train
+from sdfhub.tasks.command import main as command
 
 
 def field(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
@@ -61,11 +59,10 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
 
 
 def main() -> None:
-    if {"-m", "--multirun"} & set(sys.argv):  # launchers may train in other processes, by sdfhub's own steps
-        raise SdfhubError("-m: this makes one training; leave it out")
     AutoDecoder.objective = objective
-    train()
+    sys.argv.insert(1, "train")
+    command()
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

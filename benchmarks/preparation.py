@@ -1,9 +1,9 @@
 """Preparation: how fast one core makes signed samples of a mesh, and how many signs are right on broken ones.
 
-Run: python benchmarks/preparation.py [FOLDER | open] [--samples 500000] [--limit 8 | --all] [--workers]
+Run: python benchmarks/preparation.py [open] [--samples 500000] [--limit 8 | --all] [--workers]
 
-`open` stands for the furniture of data=open (`make data` fetches it), evenly over its categories. Without a
-folder the meshes are procedural chairs, each also with half its faces turned, so that both paths are timed.
+`open` stands for the furniture of data=open (`make data` fetches it), evenly over its categories. Without it
+the meshes are procedural chairs, each also with half its faces turned, so that both paths are timed.
 Time is that of the processor, from the mesh file's bytes to samples in memory; writing them is not in it.
 Beside the stages' shares stand the rates of the libraries alone on the same work: embree on the last rays of
 the mesh as they came and shuffled, libigl's distances on 50,000 of the samples in Morton order; and the share
@@ -21,32 +21,31 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 for name in ("OMP_NUM_THREADS", "IGL_NUM_THREADS"):  # a rate per core needs one thread
     os.environ[name] = "1"
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import igl  # noqa: E402
 import numpy as np  # noqa: E402
-import trimesh  # noqa: E402
 from embreex.rtcore_scene import EmbreeScene  # noqa: E402
 from manifold3d import Manifold, OpType  # noqa: E402
-from runs import at_least, run_benchmark  # noqa: E402
+from runs import ROOT, head, row  # noqa: E402
+
+sys.path.insert(0, str(ROOT))
 
 from sdfhub.data.preparation import sampling, visibility  # noqa: E402
-from sdfhub.data.preparation.settings import Preparation  # noqa: E402
+from sdfhub.data.preparation.sampling import Preparation  # noqa: E402
 from sdfhub.data.preparation.signs import SIGN_METHODS  # noqa: E402
 from sdfhub.data.sources import OpenSource  # noqa: E402
 from sdfhub.data.workers import map_in_processes  # noqa: E402
-from sdfhub.errors import RejectedMesh, SdfhubError  # noqa: E402
+from sdfhub.errors import RejectedMesh  # noqa: E402
 from sdfhub.geometry.morton import morton_order  # noqa: E402
 from sdfhub.procedural import generate  # noqa: E402
 from sdfhub.shapes import Mesh, ShapeSamples  # noqa: E402
 from tests.broken_twins import BREAKAGES, chair_parts, errors, flipped, refined, ring, triangles  # noqa: E402
 from tests.categories import CATEGORIES  # noqa: E402
 
-SUFFIXES = {".obj", ".ply", ".stl", ".off", ".glb"}
 STAGES = {"visible_surface": "rays", "nearest_points": "distance"}
 
 
@@ -115,30 +114,24 @@ def raw_rates(samples: ShapeSamples) -> tuple[float, float, float]:
 Loader = Callable[[], Mesh]
 
 
-def meshes(folder: Path | None, limit: int) -> Iterator[tuple[str, Loader]]:
-    """Names and loaders of the meshes in a folder, or of procedural chairs whole and half turned."""
-    if folder is None:
-        for index in range(limit):
-            chair = generate("chairs", index)
-            yield f"chair {index}", lambda chair=chair: chair
-            yield f"chair {index}, half turned", lambda c=chair, i=index: flipped(c, np.random.default_rng(i))
-        return
-    if folder == Path("open"):
-        source = OpenSource({name: rule for name, rule in CATEGORIES.items() if name != "planes"})
-        shapes = source.shapes()
-        for shape in shapes[:: max(1, len(shapes) // limit)][:limit]:
-            yield shape.id, lambda shape=shape: source.load(shape)
-        return
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise SdfhubError(f"{folder}: is no folder with meshes ({', '.join(sorted(SUFFIXES))})")
-    for path in paths[:: max(1, len(paths) // limit)][:limit]:
-        yield path.stem, lambda path=path: _loaded(path)
+def furniture() -> OpenSource:
+    return OpenSource({name: rule for name, rule in CATEGORIES.items() if name != "planes"})
 
 
-def _loaded(path: Path) -> Mesh:
-    mesh = trimesh.load_mesh(path, process=False)
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+def evenly(shapes: list, limit: int) -> list:
+    return shapes[:: max(1, len(shapes) // limit)][:limit]
+
+
+def meshes(open: str | None, limit: int) -> Iterator[tuple[str, Loader]]:
+    """Names and loaders of the open furniture, or of procedural chairs whole and half turned."""
+    if open:
+        source = furniture()
+        yield from ((shape.id, partial(source.load, shape)) for shape in evenly(source.shapes(), limit))
+        return
+    for index in range(limit):
+        chair = generate("chairs", index)
+        yield f"chair {index}", lambda chair=chair: chair
+        yield f"chair {index}, half turned", lambda c=chair, i=index: flipped(c, np.random.default_rng(i))
 
 
 COLUMNS = (
@@ -147,11 +140,11 @@ COLUMNS = (
 )
 
 
-def print_rates(folder: Path | None, limit: int, preparation: Preparation) -> None:
+def print_rates(open: str | None, limit: int, preparation: Preparation) -> None:
     """Samples a second and core, the stages' shares of the time, the libraries' own rates, rejections."""
     watch, rates, rejected = Stopwatch(), [], Counter()
-    print(f"| {COLUMNS} |\n|{' --- |' * len(COLUMNS.split('|'))}")
-    for name, load in meshes(folder, limit):
+    head(COLUMNS)
+    for name, load in meshes(open, limit):
         watch.seconds.clear()
         CountedScene.rays, CountedScene.last = 0, ()
         start = time.process_time()
@@ -164,10 +157,7 @@ def print_rates(folder: Path | None, limit: int, preparation: Preparation) -> No
             continue
         total = time.process_time() - start
         rates.append(preparation.samples / total)
-        print(
-            f"| {name} | {len(mesh[1])} | {rates[-1]:,.0f} | {_row(watch.seconds, total, samples)} |",
-            flush=True,
-        )
+        row(name, len(mesh[1]), f"{rates[-1]:,.0f}", *_shares(watch.seconds, total, samples))
     if rates:
         low, middle, high = np.min(rates), np.median(rates), np.max(rates)
         slow = sum(rate < 80_000 for rate in rates)
@@ -176,7 +166,7 @@ def print_rates(folder: Path | None, limit: int, preparation: Preparation) -> No
     print(f"prepared {len(rates)}, rejected {rejected.total()}: {dict(rejected)}\n")
 
 
-def _row(seconds: dict[str, float], total: float, samples: ShapeSamples) -> str:
+def _shares(seconds: dict[str, float], total: float, samples: ShapeSamples) -> list[str]:
     shares = [seconds[stage] / total for stage in ("load", "rays", "distance", "sign")]
     in_order, shuffled, distances = raw_rates(samples)
     cells = [f"{share:.0%}" for share in (*shares, 1 - sum(shares))]
@@ -186,7 +176,7 @@ def _row(seconds: dict[str, float], total: float, samples: ShapeSamples) -> str:
     else:  # a clean closed mesh needs none
         cells += ["0", "", "", ""]
     reached = len(samples.points) / seconds["distance"] / distances
-    return " | ".join([*cells, f"{distances / 1e6:.2f}", f"{reached:.0%}"])
+    return [*cells, f"{distances / 1e6:.2f}", f"{reached:.0%}"]
 
 
 class Prepare:
@@ -204,27 +194,24 @@ class Prepare:
         return time.process_time() - start
 
 
-def print_scaling(folder: Path | None, limit: int, preparation: Preparation, rounds: int = 2) -> None:
+def print_scaling(open: str | None, limit: int, preparation: Preparation, rounds: int = 2) -> None:
     """Seconds for the same meshes by one and by two worker processes, their start included.
 
     Where other work takes the cores, the ratio of the processor's seconds tells what two processes cost each
     other: 1.00 is linear.
     """
-    source = OpenSource({n: r for n, r in CATEGORIES.items() if n != "planes"}) if folder else None
-    shapes = source.shapes() if source else list(range(limit))
-    shapes, prepare = shapes[:: max(1, len(shapes) // limit)][:limit], Prepare(preparation, source)
-    print(
-        f"{len(shapes)} meshes\n\n| s with 1 process | with 2 | ratio | processor s with 1 | with 2 | ratio |"
-    )
-    print("|" + " --- |" * 6)
+    source = furniture() if open else None
+    shapes = evenly(source.shapes(), limit) if source else list(range(limit))
+    prepare = Prepare(preparation, source)
+    print(f"{len(shapes)} meshes")
+    head("s with 1 process | with 2 | ratio | processor s with 1 | with 2 | ratio")
     for _ in range(rounds):
         wall, busy = [], []
         for workers in (1, 2):
             start = time.perf_counter()
             busy.append(sum(seconds for _, seconds in map_in_processes(prepare, shapes, workers)))
             wall.append(time.perf_counter() - start)
-        pairs = [f"{one:.1f} | {two:.1f} | {one / two:.2f}" for one, two in (wall, busy)]
-        print(f"| {' | '.join(pairs)} |", flush=True)
+        row(*(f"{one:.1f} | {two:.1f} | {one / two:.2f}" for one, two in (wall, busy)))
 
 
 def clean_shapes() -> list[Mesh]:
@@ -254,23 +241,18 @@ def print_accuracy(samples: int = 20_000) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "folder", nargs="?", type=Path, help="meshes, or `open`; procedural chairs if left out"
-    )
-    parser.add_argument("--samples", type=at_least(2), default=500_000)
-    parser.add_argument("--limit", type=at_least(1), default=8, help="at most this many meshes")
+    parser.add_argument("source", nargs="?", choices=["open"], help="else procedural chairs")
+    parser.add_argument("--samples", type=int, default=500_000)
+    parser.add_argument("--limit", type=int, default=8, help="at most this many meshes")
     parser.add_argument("--all", action="store_true", help="every mesh")
     parser.add_argument("--workers", action="store_true", help="one and two processes instead")
     args = parser.parse_args()
     limit = 10**9 if args.all else args.limit
     if args.workers:
-        if args.folder not in (None, Path("open")):
-            parser.error(f"--workers: takes `open` or no folder, not {args.folder}")
-        print_scaling(args.folder, limit, Preparation(samples=args.samples))
-        return
-    print_rates(args.folder, limit, Preparation(samples=args.samples))
+        return print_scaling(args.source, limit, Preparation(samples=args.samples))
+    print_rates(args.source, limit, Preparation(samples=args.samples))
     print_accuracy()
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -1,7 +1,7 @@
 """Unseen shapes from scans of every kind: how good, how honest, how fast.
 
     python benchmarks/reconstruction.py --space RUN [--kinds samples oriented] [--shapes 8] [--strangers 6]
-        [--reference 2] [--sheet sheet.png] [overrides of conf/reconstruct.yaml]
+        [--reference 2] [overrides of conf/reconstruct.yaml]
 
 Shapes: of the space's source, neither trained on nor calibrated with. Kinds: signed samples; 8192 points with
 normals; the same bare; the same with noise of 0.5% of the size (0.01: in the normalised frame, shapes are
@@ -19,43 +19,44 @@ of a scan point) and where not.
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
-from runs import at_least, run_benchmark
+from omegaconf import DictConfig
+from runs import head, row
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from sdfhub.scans.target import Target, observed
-from sdfhub.tasks.calibration import Alike, Limits, unseen_shapes
-from sdfhub.tasks.reconstructor import Found, Reconstructor
 
+import sdfhub
+from sdfhub.composition import configuration_folder
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.data.splits import split
 from sdfhub.data.store.store import prepare, shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.geometry.contact_sheet import contact_sheet
-from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import judge, point_to_surface
-from sdfhub.geometry.render import render
 from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.opening import data_of, read_run
+from sdfhub.reconstruction.reconstructor import Reconstructor
+from sdfhub.reconstruction.result import Limits, Result
+from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import Scan
-from sdfhub.tasks.app import register_resolvers
-from sdfhub.tasks.build import build, plain
-from sdfhub.tasks.conf_files import configuration_folder
-from sdfhub.tasks.reconstruct import limits_of, reconstructor
-from sdfhub.tasks.run import read_run
+from sdfhub.scans.simulated import ScanKind
+from sdfhub.shapes import Mesh
+from sdfhub.tasks.reconstruct import limits_of, parts, unseen_shapes
 
 KINDS = {
-    "samples": Alike("samples", 0, 0.0),
-    "oriented": Alike("oriented", 8192, 0.0),
-    "bare": Alike("bare", 8192, 0.0),
-    "noisy": Alike("bare", 8192, 0.01),
-    "view": Alike("view", 0, 0.0),
-    "turned": Alike("oriented", 8192, 0.0),
-    "turned view": Alike("view", 0, 0.0),
+    "samples": ScanKind("samples"),
+    "oriented": ScanKind("oriented", 8192),
+    "bare": ScanKind("bare", 8192),
+    "noisy": ScanKind("bare", 8192, 0.01),
+    "view": ScanKind("view"),
+    "turned": ScanKind("oriented", 8192),
+    "turned view": ScanKind("view"),
 }
 TILT = 10.0
 """Degrees by which the upright axis of turned scans is off at most."""
@@ -63,11 +64,28 @@ SEEN = 0.02
 """Distance to a scan point within which a true surface point counts as seen."""
 
 
-def prepared_lamps(count: int, trained: dict) -> list[StoredShape]:
-    source = ProceduralSource({"lamps": {}})
-    preparation = build(trained["data"]["preparation"], "data.preparation", within="sdfhub.data")
+class Fits(NamedTuple):
+    """Reconstructions of shapes, normalised frame, their verdicts, and processor seconds a fit."""
+
+    meshes: list[Mesh]
+    results: list[Result]
+    seconds: float
+
+    def excesses(self, shapes: Sequence[StoredShape]) -> np.ndarray:
+        """[S] excess CD times 10^3, NaN without a surface."""
+        found = [judge(mesh, shape.mesh).excess for mesh, shape in zip(self.meshes, shapes, strict=True)]
+        return np.array([np.nan if excess is None else excess * 1e3 for excess in found])
+
+    def verdicts(self, wanted: str) -> str:
+        """How many of them are as they should be."""
+        return f"{sum(result.verdict == wanted for result in self.results)}/{len(self.results)}"
+
+
+def prepared_lamps(count: int, run: Path) -> list[StoredShape]:
+    """Lamps, prepared as the run's own shapes were."""
+    source, data = ProceduralSource({"lamps": {}}), data_of(read_run(run)[0])
     shapes = split(source.shapes(), 0, count, seed=4).held_out
-    return list(prepare(source, shapes, preparation, trained["data"]["store"], workers=1))
+    return list(prepare(source, shapes, data.preparation, Path(data.store), workers=1).values())
 
 
 def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:
@@ -78,9 +96,9 @@ def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:
     matrix = np.eye(4)
     matrix[:3, :3] = rng.uniform(0.1, 10) * (lie * yaw).as_matrix()
     matrix[:3, 3] = rng.uniform(-5, 5, 3)
-    turn = None if scan.normals is None else scan.normals @ (lie * yaw).as_matrix().T
+    turned = None if scan.normals is None else scan.normals @ (lie * yaw).as_matrix().T
     sensor = None if scan.sensor is None else applied(matrix, scan.sensor)
-    there = replace(scan, points=applied(matrix, scan.points), normals=turn, sensor=sensor)
+    there = replace(scan, points=applied(matrix, scan.points), normals=turned, sensor=sensor)
     return there, np.linalg.inv(matrix)
 
 
@@ -88,55 +106,33 @@ def applied(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def targets_of(
-    how: Reconstructor, kind: Alike, shapes: list[StoredShape]
-) -> tuple[list[Target], list[np.ndarray]]:
-    """What is observed of shapes, and the matrices from the scans' frames to the normalised one."""
+def observed(how: Reconstructor, kind: ScanKind, shape: StoredShape) -> tuple[ObservedScan, np.ndarray]:
+    """A scan of a shape, and the matrix from its frame to the normalised one."""
     if how.poses is None:
-        return [kind.target(each, how.evidence) for each in shapes], [np.eye(4)] * len(shapes)
-    scans = [moved(kind.scan(each), each) for each in shapes]
-    rngs = [np.random.default_rng(shape_seed(each)) for each in shapes]
-    found = [observed(scan, how.evidence, "unknown", rng) for (scan, _), rng in zip(scans, rngs, strict=True)]
-    return found, [matrix for _, matrix in scans]
+        return kind.observe(shape, how.evidence), np.eye(4)
+    scan, back = moved(kind.scan(shape), shape)
+    return observe(scan, how.evidence, "unknown", np.random.default_rng(shape_seed(shape))), back
 
 
 def fit_all(
-    how: Reconstructor, kind: Alike, shapes: list[StoredShape]
-) -> tuple[list[Mesh], list[Found], float]:
-    """Mesh of each shape, in the normalised frame, residual and doubt, and processor seconds a fit."""
-    targets, matrices = targets_of(how, kind, shapes)
-    meshes, found, seconds = [], [], 0.0
-    for target, matrix in zip(targets, matrices, strict=True):
+    how: Reconstructor, kind: ScanKind, shapes: Sequence[StoredShape], limits: Limits | None = None
+) -> Fits:
+    meshes, results, seconds = [], [], 0.0
+    for shape in shapes:
+        scan, back = observed(how, kind, shape)
         start = time.process_time()
-        fitted = how.fit([target])
+        fitted = how.fitted([scan])
         seconds += time.process_time() - start
-        (vertices, faces), _ = next(how.meshes([target], fitted))
-        near = how.poses is None or bool(how.poses.holds(fitted.poses))
-        meshes.append((applied(matrix, vertices), faces))
-        doubt = float(how.doubts(fitted)) if near else np.inf
-        found.append(Found("", residual=float(fitted.residuals), doubt=doubt, mesh="m"))
-    return meshes, found, seconds / max(1, len(targets))
+        (vertices, faces), _ = next(how.meshes([scan], fitted))
+        meshes.append(Mesh(applied(back, vertices), faces))
+        is_near = how.poses is None or bool(how.poses.holds(fitted.poses))
+        residual, doubt = float(fitted.residuals), float(how.doubts(fitted))
+        result = Result(shape.id, residual=residual, doubt=doubt, mesh="" if len(faces) else None)
+        results.append(result.judged(limits, is_near))
+    return Fits(meshes, results, seconds / max(1, len(shapes)))
 
 
-def excesses(shapes: list[StoredShape], meshes: list[Mesh]) -> np.ndarray:
-    found = [judge(mesh, shape.mesh).excess for mesh, shape in zip(meshes, shapes, strict=True)]
-    return np.array([np.nan if each is None else each * 1e3 for each in found])
-
-
-def judged(found: list[Found]) -> list[tuple[float, float]]:
-    return [(each.residual, each.doubt) for each in found]
-
-
-def right_verdicts(found: list[Found], limits: Limits | None, wanted: str) -> str:
-    given = [each.judged(limits, True).verdict for each in found]
-    return f"{given.count(wanted)}/{len(given)}"
-
-
-def render_of(mesh: Mesh) -> np.ndarray:
-    return render(*mesh, size=192) if len(mesh[1]) else "no surface"
-
-
-def view_line(shapes: list[StoredShape], kind: Alike, meshes: list[Mesh]) -> str:
+def view_line(shapes: list[StoredShape], kind: ScanKind, meshes: list[Mesh]) -> str:
     """Distances of the true surface to the reconstruction, where it was seen and where not."""
     sides: dict[str, list[float]] = {"seen": [], "unseen": []}
     for shape, mesh in zip(shapes, meshes, strict=True):
@@ -148,87 +144,58 @@ def view_line(shapes: list[StoredShape], kind: Alike, meshes: list[Mesh]) -> str
     return "; ".join(f"{name} {np.median(of):.1f} (worst {max(of):.1f})" for name, of in sides.items())
 
 
-def row(name: str, excess: np.ndarray, base: float, seconds: float, own: str = "", others: str = "") -> None:
-    numbers = [np.nanmedian(excess), np.nanmean(excess), np.nanmedian(excess) / base]
-    cells = [f"{value:.4f}" for value in numbers[:2]] + [f"{numbers[2]:.2f}", str(np.isnan(excess).sum())]
-    print(f"| {name} | {' | '.join([*cells, own, others, f'{seconds:.1f}'])} |", flush=True)
+def line(name: str, excess: np.ndarray, base: float, seconds: float, own: str = "", others: str = "") -> None:
+    middle, mean = np.nanmedian(excess), np.nanmean(excess)
+    cells = f"{middle:.4f}", f"{mean:.4f}", f"{middle / base:.2f}", np.isnan(excess).sum()
+    row(name, *cells, own, others, f"{seconds:.1f}")
+
+
+def composed(run: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(configuration_folder()), version_base="1.3"):
+        return compose("reconstruct", [f"run={run}", "scans=-", "frame=normalised", *overrides])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--space", type=Path, required=True, help="folder of a trained run")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--shapes", type=at_least(1), default=8)
-    parser.add_argument("--strangers", type=at_least(0), default=6)
-    parser.add_argument(
-        "--reference", type=at_least(0), default=0, help="shapes also fitted by DeepSDF's recipe"
-    )
-    parser.add_argument("--base", type=float, help="median excess from samples, where these are not run")
-    parser.add_argument("--sheet", type=Path, help="PNG: the truth above its reconstructions")
+    parser.add_argument("--shapes", type=int, default=8)
+    parser.add_argument("--strangers", type=int, default=6)
+    parser.add_argument("--reference", type=int, default=0, help="shapes also fitted by DeepSDF's recipe")
     arguments, overrides = parser.parse_known_args()
     torch.set_num_threads(1)
     compare(arguments, overrides)
 
 
-def configured(run: Path, overrides: list[str], method: str) -> dict:
-    register_resolvers()
-    with initialize_config_dir(str(configuration_folder()), version_base="1.3"):
-        common = [f"run={run}", "target=-", "frame=normalised", f"method={method}"]
-        return plain(compose("reconstruct", common + overrides))
-
-
 def compare(arguments: argparse.Namespace, overrides: list[str]) -> None:
-    run, still = arguments.space, configured(arguments.space, overrides, "map")
-    turned = configured(arguments.space, [*overrides, "frame=unknown"], "map")
-    trained, roles = read_run(run)
-    first = still["calibration"]["shapes"]
-    shapes = unseen_shapes(trained, roles, still["data"], first + arguments.shapes)[first:]
-    strangers = prepared_lamps(arguments.strangers, trained)
-    head = "| scan | excess median | mean | ratio | no surface | own fitted | strangers doubtful | s |"
-    print(f"{head}\n{'| --- ' * 8}|", flush=True)
-    base, sheet = arguments.base or np.nan, {"truth": [render_of(truth_of(each)) for each in shapes]}
+    run = arguments.space
+    space, still = sdfhub.load(run, "cpu"), composed(run, *overrides)
+    turned = composed(run, *overrides, "frame=unknown")
+    first = still.calibration.shapes
+    shapes = unseen_shapes(run, still, first + arguments.shapes)[first:]
+    strangers = prepared_lamps(arguments.strangers, run)
+    head("scan | excess median | mean | ratio | no surface | own fitted | strangers doubtful | s")
+    base = np.nan
     for name in arguments.kinds:
         kind, config = KINDS[name], turned if "turned" in name else still
-        how = reconstructor(run, config)
-        limits = limits_of(run, how, [kind], config).get(kind)
-        meshes, own, seconds = fit_all(how, kind, shapes)
-        _, others, _ = fit_all(how, kind, strangers)
-        excess = excesses(shapes, meshes)
+        how, calibration = parts(config, space)
+        limits = limits_of(run, how, calibration, [kind], config).get(kind)
+        own, others = fit_all(how, kind, shapes, limits), fit_all(how, kind, strangers, limits)
+        excess = own.excesses(shapes)
         base = np.nanmedian(excess) if name == "samples" else base
-        right = right_verdicts(own, limits, "fitted"), right_verdicts(others, limits, "doubtful")
-        row(name, excess, base, seconds, *right)
-        lists = {"excess": excess, "own": judged(own), "strangers": judged(others)}
-        said = "; ".join(f"{key} {np.round(values, 5).tolist()}" for key, values in lists.items())
-        print(f"{name}: {limits}; {said}", file=sys.stderr, flush=True)
+        line(name, excess, base, own.seconds, own.verdicts("fitted"), others.verdicts("doubtful"))
+        lists = {"own": own.results, "strangers": others.results}
+        pairs = {key: [(r.residual, r.doubt) for r in results] for key, results in lists.items()}
+        print(f"{name}: {limits}; {pairs}; excess {excess.round(5).tolist()}", file=sys.stderr, flush=True)
         if "view" in name:
-            print(f"\n{name}, true surface to reconstruction: {view_line(shapes, kind, meshes)}\n")
-        sheet[name] = list(map(render_of, meshes))
-        if arguments.reference and name in ("samples", "oriented"):
-            compare_with_deepsdf(arguments, overrides, kind, shapes, excess, base)
-    if arguments.sheet:
-        contact_sheet(list(sheet.values()), list(sheet), [each.id for each in shapes], arguments.sheet)
-
-
-def compare_with_deepsdf(
-    arguments: argparse.Namespace,
-    overrides: list[str],
-    kind: Alike,
-    shapes: list[StoredShape],
-    excess: np.ndarray,
-    base: float,
-) -> None:
-    count = arguments.reference
-    rival = reconstructor(arguments.space, configured(arguments.space, overrides, "deepsdf"))
-    theirs, _, seconds = fit_all(rival, kind, shapes[:count])
-    row(f"{kind.kind}, first {count}", excess[:count], base, np.nan)
-    other = excesses(shapes[:count], theirs)
-    row(f"{kind.kind}, first {count}, DeepSDF's recipe", other, base, seconds)
-
-
-def truth_of(shape: StoredShape) -> Mesh:
-    mesh = shape.mesh
-    return mesh.vertices, mesh.faces
+            print(f"\n{name}, true surface to reconstruction: {view_line(shapes, kind, own.meshes)}\n")
+        if (count := arguments.reference) and name in ("samples", "oriented"):
+            rival, _ = parts(composed(run, *overrides, "fit=deepsdf"), space)
+            theirs = fit_all(rival, kind, shapes[:count])
+            line(f"{name}, first {count}", excess[:count], base, np.nan)
+            other = theirs.excesses(shapes[:count])
+            line(f"{name}, first {count}, DeepSDF's recipe", other, base, theirs.seconds)
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -23,6 +23,8 @@ from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
 
+from runs import head, row
+
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.search import objective
 from sdfhub.report.plan import read_plan
@@ -72,17 +74,13 @@ def read_search(folder: Path) -> list[Trial]:
         Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})
         for cell in cells
     ]
-    found.sort(
-        key=lambda trial: float("inf") if trial.scores["objective"] is None else trial.scores["objective"]
-    )
+    found.sort(key=lambda trial: trial.scores["objective"] or float("inf"))
     ranked = [trial._replace(name=str(rank)) for rank, trial in enumerate(found, 1)]
     defaults = folder / "defaults"
     if (defaults / "metrics.json").exists():
         scores = read_scores(defaults)
-        settings = flat(scores.config)
-        ranked.append(
-            Trial("defaults", judged(defaults, scores), {key: shown(settings[key]) for key in searched})
-        )
+        settings = {key: shown(flat(scores.config)[key]) for key in searched}
+        ranked.append(Trial("defaults", judged(defaults, scores), settings))
     return ranked
 
 
@@ -106,23 +104,20 @@ def shown(value: float | int | str) -> str:
     return f"{float(value):.3g}"
 
 
-def markdown(trials: list[Trial], best: int) -> str:
+def print_best(trials: list[Trial], best: int) -> None:
     """A table of the best trials, and of the defaults."""
-    heads = ["", *SCORES, *(trials[0].settings if trials else ())]
-    lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
+    head(" | ".join(["", *SCORES, *(trials[0].settings if trials else ())]))
     for trial in trials:
         if trial.name == "defaults" or int(trial.name) <= best:
             nothing = "failed" if trial.scores["objective"] is None else ""
-            numbers = [nothing if v is None else f"{v:.4g}" for v in trial.scores.values()]
-            lines.append("| " + " | ".join([trial.name, *numbers, *trial.settings.values()]) + " |")
-    return "\n".join(lines)
+            numbers = [nothing if value is None else f"{value:.4g}" for value in trial.scores.values()]
+            row(trial.name, *numbers, *trial.settings.values())
 
 
 def csv_text(searches: dict[str, list[Trial]]) -> str:
     """Every trial of every search, a line each."""
-    keys = list(
-        dict.fromkeys(key for trials in searches.values() for trial in trials for key in trial.settings)
-    )
+    every = [trial for trials in searches.values() for trial in trials]
+    keys = list(dict.fromkeys(key for trial in every for key in trial.settings))
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["search", "trial", *SCORES, *keys])
@@ -179,19 +174,14 @@ def main() -> None:
     parser.add_argument("--enqueue", type=Path, help="folder of another search, which tries the best first")
     arguments = parser.parse_args()
     searches: dict[str, list[Trial]] = {}
-    try:
-        for source in arguments.searches:
-            searches |= read_csv(source) if source.is_file() else {source.name: read_search(source)}
-    except SdfhubError as error:
-        parser.error(str(error))
+    for source in arguments.searches:
+        searches |= read_csv(source) if source.is_file() else {source.name: read_search(source)}
     if arguments.only:
-        if arguments.only not in searches:
-            parser.error(f"--only {arguments.only}: there are {', '.join(searches)}")
         searches = {arguments.only: searches[arguments.only]}
     for name, trials in searches.items():
         failed = sum(trial.scores["objective"] is None for trial in trials)
-        print(f"\n### {name}: {sum(trial.name != 'defaults' for trial in trials)} trials, {failed} failed\n")
-        print(markdown(trials, arguments.best))
+        print(f"\n### {name}: {sum(trial.name != 'defaults' for trial in trials)} trials, {failed} failed")
+        print_best(trials, arguments.best)
     if arguments.enqueue:
         for name, trials in searches.items():
             count = len(enqueue(trials, arguments.enqueue, arguments.best))

@@ -6,12 +6,13 @@ import numpy as np
 import torch
 from hydra import compose
 
-from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
+from sdfhub.composition import instantiate
+from sdfhub.data.loading.batches import Loading, StepBatches
 from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import distances
 from sdfhub.model.fast.side_by_side import side_by_side
-from sdfhub.tasks.build import plain
-from sdfhub.tasks.run import build_autodecoder
+from sdfhub.tasks.train import make_optimisation
 
 STORED = 100_000
 """Samples of each kind in a shape's file; a draw does not depend on what they are."""
@@ -47,6 +48,13 @@ class RandomShape:
         rows[:] = self.read(name, start, len(rows))
 
 
+def autodecoder(choice: list[str], rows: int) -> AutoDecoder:
+    """The untrained model of a training with these words on its command line."""
+    config = compose("config", overrides=choice)
+    made = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
+    return AutoDecoder(**made, optim=make_optimisation(config.optim), shapes=rows)
+
+
 class OurStep:
     """One step of what a composed config describes, without Lightning's loop around it."""
 
@@ -59,14 +67,14 @@ class OurStep:
         bf16: bool,
         device: torch.device,
     ):
-        config = plain(compose("config", overrides=choice))
-        self.model = build_autodecoder(config, rows=len(shapes), steps=1000).to(device)
+        self.model = autodecoder(choice, len(shapes)).to(device)
         self.model.on_fit_start()
-        loading = Loading(len(shapes), samples, surface, 1, 0, Augmentation(), 0)
+        loading = Loading(len(shapes), samples, surface)
         on_cpu = device.type == "cpu"
         self.batches = StepBatches(shapes, loading) if on_cpu else ResidentBatches(shapes, loading, device)
-        configured = self.model.configure_optimizers()
-        self.optimizer, self.bf16, self.step = configured["optimizer"], bf16, 0
+        weights = self.model.decoder.parameters(), self.model.codes.parameters()
+        self.optimizer, _ = self.model.optim.configure(*weights, steps=1000)
+        self.bf16, self.step = bf16, 0
 
     def __call__(self) -> None:
         batch = self.batches[self.step]
@@ -96,8 +104,7 @@ class OurField:
     """Dense evaluation of a decoder, as meshing calls it."""
 
     def __init__(self, choice: list[str], points: int, device: torch.device):
-        config = plain(compose("config", overrides=choice))
-        self.model, self.bf16 = build_autodecoder(config, rows=1).eval().to(device), False
+        self.model, self.bf16 = autodecoder(choice, 1).eval().to(device), False
         self.points = torch.rand(1, points, 3, device=device) - 0.5
 
     @torch.no_grad()

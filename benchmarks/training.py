@@ -22,8 +22,6 @@ writes what it makes once, at the rate of a copy. There too encoding=hash, by te
 is installed, by tiny-cuda-nn.
 """
 
-from runs import at_least, run_benchmark
-
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
@@ -38,23 +36,17 @@ import numpy as np
 import torch
 from hydra import initialize_config_dir
 from reference import ReferenceProcess, ReferenceStep
+from runs import head, row
 from steps import Copy, OurField, OurStep, Product, RandomShape
 
+from sdfhub.composition import configuration_folder
 from sdfhub.model.fast.computing import TOGETHER, keep_freed_memory
-from sdfhub.tasks.app import register_resolvers
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 WARM_UP = 2
 """Rounds that do not count: the reference here is a fifth slower until freed memory is of the right sizes."""
 PUBLISHED, REFERENCE = "DeepSDF, as published", "DeepSDF, in our process"
 BUSY = 2.5
 """How much slower than in our process DeepSDF's step is in its own where it waits for other programs."""
-UNREAD = ("data", "category", "trainer", "callbacks", "evaluate", "fit", "hparams_search", "sweeps", "hydra")
-"""Groups of a training that a step without data, judging or a loop around it does not read."""
-NAMED = ("decoder", "activation", "encoding", "normals", "experiment")
-"""Groups whose choices the names of the rows say."""
-UNSHARED = ("activation", "encoding")
-"""Those of them whose keys not all rows have."""
 PAPER_SAMPLES = 2000 * 16_384
 """Samples of a shape in the paper's training."""
 
@@ -65,81 +57,52 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     files = [folder / f"{index}.npz" for index in range(args.shapes)]
     for file, shape in zip(files, shapes, strict=True):
         np.savez(file, pos=shape.outside, neg=shape.inside)
-    paper = ["decoder=paper_585k", "encoding=fourier", "encoding.frequencies=12", *args.overrides]
-    deepsdf = ["experiment=deepsdf", *args.overrides]
-    surface = args.samples // 4  # as at scale=paper
-    rows = args.shapes * args.samples
-    device = torch.device(args.device)
+    device, surface = torch.device(args.device), args.samples // 4  # as at scale=paper
+    large = ["decoder=paper_585k", *args.overrides]
+    paper = ["encoding=fourier", "encoding.frequencies=12", *large]
+    deepsdf, siren = ["experiment=deepsdf", *args.overrides], ["activation=siren", *paper]
+
+    def ours(choice: list[str], points: int, bf16: bool) -> OurStep:
+        return OurStep(shapes, args.samples, points, choice, bf16, device)
+
     made: dict[str, object] = {}
     if device.type == "cpu":
         made[PUBLISHED] = ReferenceProcess(files, args.samples, torch.get_num_threads())
-    for bf16 in (False, True):
-        suffix = ", bf16" if bf16 else ""
+    for bf16, suffix in ((False, ""), (True, ", bf16")):
         made |= {
             REFERENCE + suffix: ReferenceStep(files, args.samples, device, bf16),
-            "decoder=deepsdf" + suffix: OurStep(shapes, args.samples, 0, deepsdf, bf16, device),
-            "paper_585k, HOSC, normals=off" + suffix: OurStep(
-                shapes, args.samples, 0, ["normals=off", *paper], bf16, device
-            ),
-            "paper_585k, HOSC, normals=on" + suffix: OurStep(
-                shapes, args.samples, surface, paper, bf16, device
-            ),
-            "paper_585k, SIREN, normals=on" + suffix: OurStep(
-                shapes, args.samples, surface, ["activation=siren", *paper], bf16, device
-            ),
+            "decoder=deepsdf" + suffix: ours(deepsdf, 0, bf16),
+            "paper_585k, HOSC, normals=off" + suffix: ours(["normals=off", *paper], 0, bf16),
+            "paper_585k, HOSC, normals=on" + suffix: ours(paper, surface, bf16),
+            "paper_585k, SIREN, normals=on" + suffix: ours(siren, surface, bf16),
         }
-    made |= hash_steps(shapes, args, device)
-    fields = {
-        "decoder=deepsdf": deepsdf,
-        "paper_585k, HOSC": paper,
-        "paper_585k, SIREN": ["activation=siren", *paper],
-    }
+    ways = {"tensor operations": "false"} | ({"tiny-cuda-nn": "true"} if find_spec("tinycudann") else {})
+    for name, there in ways.items():
+        choice = ["encoding=hash", f"computing.tinycudann={there}", *large]
+        made[f"paper_585k, HOSC + hash by {name}, normals=on, bf16"] = ours(choice, surface, True)
+    fields = {"decoder=deepsdf": deepsdf, "paper_585k, HOSC": paper, "paper_585k, SIREN": siren}
+    rows = args.shapes * args.samples
     made |= {f"{name}, evaluation": OurField(choice, rows, device) for name, choice in fields.items()}
     return made
 
 
-def hash_steps(
-    shapes: list[RandomShape], args: argparse.Namespace, device: torch.device
-) -> dict[str, object]:
-    """Steps with a hash encoding, by each of the ways to compute it that there are here."""
-    ways = {"tensor operations": "false"} | ({"tiny-cuda-nn": "true"} if find_spec("tinycudann") else {})
-    choice = ["decoder=paper_585k", "encoding=hash", *args.overrides]
-    return {
-        f"paper_585k, HOSC + hash by {name}, normals=on, bf16": OurStep(
-            shapes, args.samples, args.samples // 4, [*choice, f"computing.tinycudann={there}"], True, device
-        )
-        for name, there in ways.items()
-    }
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--shapes", type=at_least(1), default=4)
-    parser.add_argument("--samples", type=at_least(2), default=4096)
-    parser.add_argument("--rounds", type=at_least(3), default=5)
-    parser.add_argument("--threads", type=at_least(1), help="default: what torch takes")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--shapes", type=int, default=4)
+    parser.add_argument("--samples", type=int, default=4096)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, help="default: what torch takes")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
-    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("overrides", nargs="*", help="of every row's training: those that a step reads")
     args = parser.parse_args()
-    if args.device == "cuda" and not torch.cuda.is_available():
-        parser.error("--device cuda: PyTorch finds no GPU here")
-    for override in args.overrides:
-        key = override.lstrip("+~").partition("=")[0]
-        if key.partition(".")[0] in UNREAD:
-            parser.error(f"{override}: no step here reads it; --shapes and --samples say what a batch has")
-        if key in NAMED or key.partition(".")[0] in UNSHARED:
-            parser.error(f"{override}: the rows to compare differ in it, and their names say how")
     if args.threads:
         torch.set_num_threads(args.threads)
-    register_resolvers()
     keep_freed_memory()  # for the references here too
     torch._dynamo.config.recompile_limit = 64  # each decoder is a version; else late ones run plain
     torch.manual_seed(0)
     with (
         tempfile.TemporaryDirectory() as folder,
-        initialize_config_dir(str(CONF), version_base=None),
+        initialize_config_dir(str(configuration_folder()), version_base="1.3"),
     ):
         steps = rivals(args, Path(folder))
         limits = limits_of(steps, torch.device(args.device))
@@ -156,17 +119,14 @@ def main() -> None:
 
 def seconds_of(step, on_gpu: bool) -> float:
     """How long a step takes after another, which may compile; on a GPU the mean of ten."""
+    count, wait = (10, torch.cuda.synchronize) if on_gpu else (1, lambda: None)
     step()
-    if not on_gpu:
-        start = time.perf_counter()
-        step()
-        return time.perf_counter() - start
-    torch.cuda.synchronize()
+    wait()
     start = time.perf_counter()
-    for _ in range(10):
+    for _ in range(count):
         step()
-    torch.cuda.synchronize()
-    return (time.perf_counter() - start) / 10
+    wait()
+    return (time.perf_counter() - start) / count
 
 
 def limits_of(steps: dict[str, object], device: torch.device) -> dict[object, Product | Copy]:
@@ -197,29 +157,23 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str,
         dtype = "bfloat16" if bf16 else "float32"
         print(f"product {width} wide, {dtype}: {value / 1e9:.0f} G operations a second, all threads together")
     if copy:
-        print(f"copy: {copy.bytes() / seconds['copy'] / 1e9:.0f} GB a second, read and written")
-    memory = " | of the copy's" if copy else ""
-    print(
-        "\n| step | samples/s | apart | times DeepSDF | in our process | and in bf16 "
-        f"| share of the product's rate{memory} |"
-    )
-    print("| --- " * (7 + bool(copy)) + "|")
+        copy_rate = copy.bytes() / seconds["copy"]
+        print(f"copy: {copy_rate / 1e9:.0f} GB a second, read and written")
+    rates = "times DeepSDF | in our process | and in bf16 | share of the product's rate"
+    head(f"step | samples/s | apart | {rates}{' | of the copy' * bool(copy)}")
     for name, step in steps.items():
-        shares = [0.0] * (1 + bool(copy))
-        if hasattr(step, "operations"):
-            shares[0] = step.operations() / seconds[name] / rate[limit_of(step)]
-        if copy and hasattr(step, "bytes"):
-            shares[1] = step.bytes() / seconds[name] / (copy.bytes() / seconds["copy"])
-        apart = (max(times[name]) - min(times[name])) / seconds[name]
-        faster = ["", "", ""]
-        if not isinstance(step, OurField):
-            others = [PUBLISHED, REFERENCE, *([f"{REFERENCE}, bf16"] if step.bf16 else [])]
-            compared = [
-                f"{seconds[other] / seconds[name]:.2f}" if other in seconds else "" for other in others
-            ]
-            faster[: len(compared)] = compared
-        cells = " | ".join([*faster, *(f"{share:.2f}" if share else "" for share in shares)])
-        print(f"| {name} | {rows / seconds[name]:,.0f} | {apart:.0%} | {cells} |")
+        others = [PUBLISHED, REFERENCE, f"{REFERENCE}, bf16"] if not isinstance(step, OurField) else []
+        apart, others = (max(times[name]) - min(times[name])) / seconds[name], others[: 2 + step.bf16]
+        cells = [f"{rows / seconds[name]:,.0f}", f"{apart:.0%}"]
+        cells += [f"{seconds[other] / seconds[name]:.2f}" if other in seconds else "" for other in others]
+        cells += [""] * (5 - len(cells))
+        is_ours = hasattr(step, "operations")
+        share = step.operations() / seconds[name] / rate[limit_of(step)] if is_ours else 0
+        cells.append(f"{share:.2f}" if share else "")
+        if copy:
+            share = step.bytes() / seconds[name] / copy_rate if hasattr(step, "bytes") else 0
+            cells.append(f"{share:.2f}" if share else "")
+        row(name, *cells)
     if PUBLISHED in seconds and seconds[PUBLISHED] > BUSY * seconds[REFERENCE]:
         print("\nDeepSDF's own process is that slow where others are at work: go by 'in our process'")
     for bf16 in ("", ", bf16"):
@@ -237,4 +191,4 @@ def report(args: argparse.Namespace, steps: dict, limits: dict, times: dict[str,
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

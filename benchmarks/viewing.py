@@ -10,7 +10,7 @@ import argparse
 import queue
 import statistics
 
-from runs import at_least, run_benchmark
+from runs import head, row
 
 import sdfhub
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
@@ -23,8 +23,8 @@ def milliseconds(space: sdfhub.Space, resolution: int, shapes: int) -> float:
     shown: queue.Queue[Meshed] = queue.Queue()
     mesher = LiveMesher(space.decoder, [resolution], shown.put)
     found = []
-    for row in range(shapes + 1):
-        mesher.ask(space.code(row % len(space.ids)))
+    for index in range(shapes + 1):
+        mesher.ask(space.code(index % len(space.ids)))
         found.append(shown.get().seconds)
     mesher.close()
     return 1e3 * statistics.median(found[1:])
@@ -33,14 +33,15 @@ def milliseconds(space: sdfhub.Space, resolution: int, shapes: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", help="folder of a trained run")
-    parser.add_argument("shapes", nargs="?", type=at_least(1), default=8)
+    parser.add_argument("shapes", nargs="?", type=int, default=8)
     arguments = parser.parse_args()
     space = sdfhub.load(arguments.run)
     weights = sum(weight.numel() for weight in space.decoder.parameters())
-    print(f"{arguments.run}: {weights:,} weights, on {space.device}\n\n| grid | ms |\n| --- | --- |")
+    print(f"{arguments.run}: {weights:,} weights, on {space.device}")
+    head("grid | ms")
     for resolution in RESOLUTIONS:
-        print(f"| {resolution}^3 | {milliseconds(space, resolution, arguments.shapes):.0f} |", flush=True)
+        row(f"{resolution}^3", f"{milliseconds(space, resolution, arguments.shapes):.0f}")
 
 
 if __name__ == "__main__":
-    run_benchmark(main)
+    main()

@@ -16,6 +16,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.report.results import ROLES
 from sdfhub.tasks import train as train_task
+from sdfhub.tasks.command import main
 from tests.sweep_folders import score
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -59,9 +60,9 @@ class Training:
 
     def start(self, *words: str) -> int:
         """The exit status of `python train.py WORDS`."""
-        sys.argv = ["train.py", *words]
+        sys.argv = ["sdfhub", "train", *words]
         try:
-            train_task.main()
+            main()
         except SystemExit as stop:
             return stop.code
         return 0
@@ -72,5 +73,5 @@ def stand_in(monkeypatch, folder: Path) -> Training:
     training = Training()
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", [])
-    monkeypatch.setattr(train_task, "train", training)
+    monkeypatch.setattr(train_task, "train_into", training)
     return training

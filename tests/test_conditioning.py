@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from sdfhub.model.conditioning import Concat, Film
-from tests.test_config import parameters
-from tests.test_model import ACTIVATIONS, small_decoder
+from tests.test_model import ACTIVATIONS, parameters, small_decoder
 from tests.tiny import build_autodecoder, composed
 
 SETTINGS = [{}, {"tanh": True, "weight_norm": False}, {"inject_encoding": [1, 2], "inject_code": [1, 2]}]

@@ -12,6 +12,7 @@ import trimesh
 from sdfhub.data.loading import Augmentation, Loading, SdfDataModule, ValidationShape
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources import FolderSource, ProceduralSource
+from sdfhub.described import check_arguments
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 from tests.test_store import Balls
@@ -165,8 +166,8 @@ def test_normals_are_refused_before_a_shape_is_listed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("setting", ["workers", "shapes", "held_out", "split_seed", "validation_shapes"])
 def test_numbers_out_of_range_are_refused_by_name(setting):
-    with pytest.raises(SdfhubError, match=rf"data\.{setting}=-1: must be at least"):
-        SdfDataModule(Balls(1), **{setting: -1})
+    with pytest.raises(SdfhubError, match=rf"data\.{setting}=-1: should be greater than"):
+        check_arguments(SdfDataModule, {setting: -1}, "data")
 
 
 def test_a_folder_of_eight_meshes_is_enough(tmp_path, caplog):

@@ -128,7 +128,15 @@ def test_meshes_are_written_in_their_sources_frame(trained):
 def test_tensorboard_has_every_curve_picture_and_mesh(trained):
     events = EventAccumulator(str(trained[0] / "tensorboard"))
     events.Reload()
-    wanted = ["loss/sdf", "loss/code", "loss/normal", "loss/total", "lr-Adam/decoder", "lr-Adam/codes", "codes/norm"]
+    wanted = [
+        "loss/sdf",
+        "loss/code",
+        "loss/normal",
+        "loss/total",
+        "lr-Adam/decoder",
+        "lr-Adam/codes",
+        "codes/norm",
+    ]
     wanted += ["beta/layer_0", "omega/layer_0", "speed/samples_per_second", "mesh/cd", "mesh/failed"]
     assert set(wanted) <= set(events.Tags()["scalars"])
     assert any("slice" in tag for tag in events.Tags()["images"])
@@ -366,7 +374,7 @@ def test_a_full_memory_of_the_gpu_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(L.pytorch.Trainer, "fit", full)
     shapes = ["data.shapes=1", "data.held_out=0", f"data.store={tmp_path / 'store'}", "callbacks=none"]
     with pytest.raises(SdfhubError, match=r"lower computing\.points_at_once"):
-        task.train(composed(*TINY, *shapes), tmp_path / "run")
+        task.train_into(composed(*TINY, *shapes), tmp_path / "run")
 
 
 def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path):
@@ -459,5 +467,5 @@ def test_real_furniture_trains_to_a_table(tmp_path):
     assert len(metrics["train"]["shapes"]) >= 2
     config = yaml.safe_load((folder / "config.yaml").read_text())
     data = data_of(config)
-    assert all(shape.credits["licence"] for shape in data.filled(data.split))
+    assert all(shape.credits["licence"] for shape in data.filled(data.split).values())
     assert config["data"]["source"]["root"] == str(OPEN), "a run is judged from anywhere"

@@ -14,10 +14,9 @@ from PIL import Image
 import sdfhub
 from sdfhub.composition import instantiate
 from sdfhub.geometry.animation import animation
-from sdfhub.tasks import export, interpolate, neighbours, reconstruct, sample
 from sdfhub.tasks.export import as_function, function_file
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
-from tests.tiny import composed
+from tests.tiny import composed, run_command
 
 TINY = ["decoder.depth=2", "decoder.width=24", "decoder.code_size=4", "decoder.inject_code=[1]"]
 DECODERS = {
@@ -31,15 +30,11 @@ def run(tmp_path_factory):
     return write_ball_run(tmp_path_factory.mktemp("balls") / "run")
 
 
-def told(monkeypatch, capsys, task, *words: str, expect: int = 0) -> str:
+def told(monkeypatch, capsys, task: str, *words: str, expect: int = 0) -> str:
     """What a task prints, or the last line of its complaint."""
-    monkeypatch.setattr(sys, "argv", ["sdfhub", *words])
+    assert run_command(monkeypatch, *words, task=task) == expect
     if not expect:
-        task.main()
         return capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        task.main()
-    assert stop.value.code == expect
     message = capsys.readouterr().err.strip().splitlines()
     assert len(message) == 1 and message[0].startswith("sdfhub: error: ")
     return message[0]
@@ -66,12 +61,12 @@ def test_an_exported_function_is_the_decoder_for_any_number_of_shapes_and_points
 
 def test_without_onnx_its_export_says_what_to_install(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    message = told(monkeypatch, capsys, export, f"run={run}", "to=onnx", expect=2)
+    message = told(monkeypatch, capsys, "export", f"run={run}", "to=onnx", expect=2)
     assert "pip install 'sdfhub[onnx]'" in message
 
 
 def test_a_function_is_written_with_the_codes_beside_it(run, monkeypatch, capsys, tmp_path):
-    printed = told(monkeypatch, capsys, export, f"run={run}", f"to={tmp_path / 'balls.pt2'}")
+    printed = told(monkeypatch, capsys, "export", f"run={run}", f"to={tmp_path / 'balls.pt2'}")
     assert str(tmp_path / "balls.pt2") in printed
     space = sdfhub.load(tmp_path / "balls.safetensors", device="cpu")
     function = torch.export.load(tmp_path / "balls.pt2").module()
@@ -80,7 +75,7 @@ def test_a_function_is_written_with_the_codes_beside_it(run, monkeypatch, capsys
 
 
 def test_a_space_in_one_file_needs_no_run(run, monkeypatch, capsys):
-    told(monkeypatch, capsys, export, f"run={run}", "to=safetensors")
+    told(monkeypatch, capsys, "export", f"run={run}", "to=safetensors")
     path = run / "export" / "model.safetensors"
     code = f"import sys, sdfhub\nprint(*sdfhub.load({str(path)!r}).ids)\nprint('lightning' in sys.modules)"
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -93,7 +88,7 @@ def test_a_space_in_one_file_needs_no_run(run, monkeypatch, capsys):
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
 def test_meshes_are_exported_in_their_sources_frame(run, monkeypatch, capsys, tmp_path, suffix):
     words = [f"run={run}", "to=meshes", f"shapes=[{IDS[1]},2]", f"format={suffix}", "resolution=16"]
-    printed = told(monkeypatch, capsys, export, *words, f"out={tmp_path}")
+    printed = told(monkeypatch, capsys, "export", *words, f"out={tmp_path}")
     assert "2 in their source's frame" in printed
     files = sorted(path.relative_to(tmp_path / "meshes") for path in tmp_path.rglob("*.*"))
     assert [str(file) for file in files] == [f"{IDS[2]}.{suffix}", f"{IDS[1]}.{suffix}"]
@@ -106,7 +101,7 @@ def test_interpolation_is_a_strip_an_animation_there_and_back_a_scene_and_meshes
     run, monkeypatch, capsys, tmp_path
 ):
     words = [f"run={run}", f"a={IDS[0]}", "b=3", "steps=4", "resolution=16", f"out={tmp_path}"]
-    told(monkeypatch, capsys, interpolate, *words)
+    told(monkeypatch, capsys, "interpolate", *words)
     with Image.open(tmp_path / "animation.gif") as gif:
         assert gif.n_frames == 6 and gif.info["loop"] == 0
         frames = []
@@ -125,41 +120,41 @@ def test_interpolation_is_a_strip_an_animation_there_and_back_a_scene_and_meshes
     scene = trimesh.load_scene(tmp_path / "meshes.glb")
     assert len(scene.geometry) == 4 and scene.extents[0] > 6
     words[3] = "steps=2"
-    told(monkeypatch, capsys, interpolate, *words)
+    told(monkeypatch, capsys, "interpolate", *words)
     assert len(list(tmp_path.glob("meshes/*"))) == 2, "those of the longer way are gone"
 
 
 def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch, capsys):
-    printed = told(monkeypatch, capsys, sample, f"run={run}", "n=3", "resolution=12")
+    printed = told(monkeypatch, capsys, "sample", f"run={run}", "n=3", "resolution=12")
     assert printed.count("nearest training shape: balls/") == 3
     assert len(list((run / "sample" / "seed_0" / "meshes").iterdir())) <= 3
-    printed = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={IDS[0]}", "k=2", "resolution=12")
+    printed = told(monkeypatch, capsys, "neighbours", f"run={run}", f"of={IDS[0]}", "k=2", "resolution=12")
     assert printed.splitlines()[0].split()[0] == sdfhub.load(run).neighbours(IDS[0], 1)[0][0]
     assert (run / "neighbours" / "balls-small" / "strip.png").is_file()
     scan = run / "scan.xyz"
     away = np.random.default_rng(0).normal(size=(2000, 3))
     np.savetxt(scan, 7 + 3 * away / np.linalg.norm(away, axis=1, keepdims=True))
-    printed = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={scan}", "k=1", "resolution=12")
+    printed = told(monkeypatch, capsys, "neighbours", f"run={run}", f"of={scan}", "k=1", "resolution=12")
     assert printed.splitlines()[0].split()[0] in IDS
     assert (run / "neighbours" / "scan.xyz" / "strip.png").is_file()
     np.savez(run / "view.npz", points=away[:200], sensor=np.array([0, 0, 9.0]))
-    complaint = told(monkeypatch, capsys, neighbours, f"run={run}", f"of={run / 'view.npz'}", expect=2)
+    complaint = told(monkeypatch, capsys, "neighbours", f"run={run}", f"of={run / 'view.npz'}", expect=2)
     assert "view.npz: is a single view" in complaint
 
 
 MISTAKES = [
-    (interpolate, ["a=balls/smal", "b=0"], "did you mean 'balls/small'"),
-    (interpolate, ["a=0"], "Missing mandatory value: b"),
-    (interpolate, ["a=0", "b=1", "steps=1"], "steps=1: must be a whole number, at least 2"),
-    (interpolate, ["a=0", "b=1", "resolution=fine"], "resolution='fine'"),
-    (sample, ["n=0"], "n=0"),
-    (neighbours, ["of=9"], "rows are 0 to 3"),
-    (export, ["to=stl"], "choose safetensors, onnx, torch_export, meshes"),
-    (export, ["to=meshes", "format=stl"], "format='stl'"),
-    (export, ["to=meshes", "shapes=[cube]"], "not trained on a shape 'cube'"),
-    (export, ["to=meshes", "shapes=cube"], "not trained on a shape 'cube'"),
-    (export, ["to=meshes", "shapes=[]"], "shapes=[]"),
-    (export, ["to=meshes", "resolution=1"], "resolution=1"),
+    ("interpolate", ["a=balls/smal", "b=0"], "did you mean 'balls/small'"),
+    ("interpolate", ["a=0"], "Missing mandatory value: b"),
+    ("interpolate", ["a=0", "b=1", "steps=1"], "steps=1: must be a whole number, at least 2"),
+    ("interpolate", ["a=0", "b=1", "resolution=fine"], "resolution='fine'"),
+    ("sample", ["n=0"], "n=0"),
+    ("neighbours", ["of=9"], "rows are 0 to 3"),
+    ("export", ["to=stl"], "choose safetensors, onnx, torch_export, meshes"),
+    ("export", ["to=meshes", "format=stl"], "format='stl'"),
+    ("export", ["to=meshes", "shapes=[cube]"], "not trained on a shape 'cube'"),
+    ("export", ["to=meshes", "shapes=cube"], "not trained on a shape 'cube'"),
+    ("export", ["to=meshes", "shapes=[]"], "shapes=[]"),
+    ("export", ["to=meshes", "resolution=1"], "resolution=1"),
 ]
 
 
@@ -173,26 +168,22 @@ def test_a_mistake_is_one_line_that_names_it(run, monkeypatch, capsys, task, wor
     [("step=3", "Could not override 'step'"), ("activation=relu", "Could not override 'activation'")],
 )
 def test_a_key_that_a_task_does_not_have_is_refused_by_name(run, monkeypatch, capsys, word, message):
-    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={run}", "a=0", "b=1", word])
-    with pytest.raises(SystemExit) as stop:
-        interpolate.main()
+    assert run_command(monkeypatch, f"run={run}", "a=0", "b=1", word, task="interpolate") == 1
     told = capsys.readouterr().err
-    assert stop.value.code == 1 and told.startswith(message) and "Traceback" not in told
+    assert told.startswith(message) and "Traceback" not in told
 
 
-@pytest.mark.parametrize("task", [export, interpolate, sample, neighbours, reconstruct])
+@pytest.mark.parametrize("task", ["export", "interpolate", "sample", "neighbours", "reconstruct"])
 def test_help_tells_the_tasks_own_keys(task, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["sdfhub", "--help"])
-    with pytest.raises(SystemExit) as stop:
-        task.main()
+    assert run_command(monkeypatch, "--help", task=task) == 0
     keys = capsys.readouterr().out.partition("== Config ==")[2].splitlines()
-    assert not stop.value.code and {"run: ???", "out: null"} <= set(keys)
+    assert {"run: ???", "out: null"} <= set(keys)
     assert not any(key.startswith(("activation:", "hydra:")) for key in keys)
 
 
 def test_a_missing_run_is_named(monkeypatch, capsys, tmp_path):
     for folder, message in ((tmp_path / "nowhere", "no such run or file"), (tmp_path, "not a run's folder")):
-        assert message in told(monkeypatch, capsys, sample, f"run={folder}", expect=2)
+        assert message in told(monkeypatch, capsys, "sample", f"run={folder}", expect=2)
 
 
 def test_an_animation_of_one_picture_stands_still(tmp_path):

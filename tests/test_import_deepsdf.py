@@ -3,7 +3,6 @@
 import copy
 import json
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,8 @@ from omegaconf import DictConfig
 import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import read_run
-from sdfhub.tasks.import_deepsdf import OWN_KEYS, import_deepsdf, main
-from tests.tiny import composed
+from sdfhub.tasks.import_deepsdf import OWN_KEYS, import_deepsdf
+from tests.tiny import composed, run_command
 
 L, W = 5, 24
 SPECS = {
@@ -124,7 +123,8 @@ def imported(config: DictConfig, folder: Path, root: Path = Path("data"), **sett
     config.data.source.root = str(root)
     settings = {"folder": str(experiment), "out": str(folder / "run")} | settings
     config.update(settings)
-    return sdfhub.load(import_deepsdf(config), device="cpu")
+    import_deepsdf(config)
+    return sdfhub.load(config.out, device="cpu")
 
 
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
@@ -206,7 +206,7 @@ def test_files_that_are_missing_or_broken_are_named(config, tmp_path):
     torch.save({"latent_codes": codes[:, :4]}, experiment / "LatentCodes" / "1000.pth")
     assert "no codes of 5 numbers" in refusal(config, tmp_path, epoch=1000)
     (experiment / "specs.json").write_text("{")
-    assert "not JSON" in refusal(config, tmp_path)
+    assert "invalid json" in refusal(config, tmp_path)
     (experiment / "specs.json").unlink()
     assert "not an experiment of DeepSDF's" in refusal(config, tmp_path)
 
@@ -241,12 +241,9 @@ def test_importing_runs_no_code_of_the_experiment(config, tmp_path):
 
 def test_the_command_takes_the_folder_as_its_first_word_and_writes_over_no_run(monkeypatch, tmp_path, capsys):
     write_experiment(tmp_path)
-    argv = ["sdfhub", str(tmp_path / "examples" / "balls"), f"paths.output={tmp_path / 'outputs'}"]
-    monkeypatch.setattr(sys, "argv", argv)
-    main()
+    words = [str(tmp_path / "examples" / "balls"), f"paths.output={tmp_path / 'outputs'}"]
+    assert run_command(monkeypatch, *words, task="import-deepsdf") == 0
     assert "3 shapes, 0 of them with their source's frame" in capsys.readouterr().out
     assert sdfhub.load(tmp_path / "outputs" / "deepsdf" / "balls").ids == tuple(IDS)
-    monkeypatch.setattr(sys, "argv", ["sdfhub", argv[1], argv[2]])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2 and "is there already" in capsys.readouterr().err
+    assert run_command(monkeypatch, *words, task="import-deepsdf") == 2
+    assert "is there already" in capsys.readouterr().err

@@ -84,7 +84,7 @@ def test_a_changed_library_is_measured_again(furniture):
 def test_a_zip_bomb_is_refused(furniture, monkeypatch):
     source = OpenSource({"chairs": CATEGORIES["chairs"]}, str(furniture))
     shape = source.shapes()[0]
-    monkeypatch.setattr("sdfhub.data.sources.furniture.MAX_MODEL", 1000)
+    monkeypatch.setattr("sdfhub.data.sources.open.MAX_MODEL", 1000)
     with pytest.raises(RejectedMesh, match="corrupt_file"):
         source.load(shape)
 
@@ -110,7 +110,7 @@ def test_a_library_whose_packed_bytes_are_damaged_is_named(furniture):
     [
         ({"include": "("}, r"catalogue\.include"),
         ({"exclude": "x"}, r"catalogue\.include"),
-        ({"inlcude": "x"}, "expected exclude and include"),
+        ({"include": "x", "exlcude": "x"}, r"category\.chairs\.catalogue\.exlcude"),
     ],
 )
 def test_wrong_rules_name_their_key(change, message):

@@ -11,8 +11,6 @@ import yaml
 import sdfhub
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
-from sdfhub.tasks import evaluate as evaluate_task
-from sdfhub.tasks import export as export_task
 from tests.tiny import TINY, run_command, scores, train_tiny
 
 PACKAGE = """
@@ -71,10 +69,10 @@ def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_expo
         sdfhub.load(run)
     capsys.readouterr()
     small = ["evaluate.resolution=24", "evaluate.points=500", "fit.samples=500"]
-    assert run_command(monkeypatch, str(run), *small, main=evaluate_task.main) == 2
+    assert run_command(monkeypatch, str(run), *small, task="evaluate") == 2
     assert "trust=mypkg" in capsys.readouterr().err
-    assert run_command(monkeypatch, str(run), *small, "trust=mypkg", main=evaluate_task.main) == 0
-    assert run_command(monkeypatch, str(run), "safetensors", "trust=mypkg", main=export_task.main) == 0
+    assert run_command(monkeypatch, str(run), *small, "trust=mypkg", task="evaluate") == 0
+    assert run_command(monkeypatch, str(run), "safetensors", "trust=mypkg", task="export") == 0
     with pytest.raises(SdfhubError, match="trust=mypkg"):
         sdfhub.load(run / "export" / "model.safetensors")
     assert sdfhub.load(run / "export" / "model.safetensors", trust=["mypkg"]).ids == space.ids
@@ -156,12 +154,10 @@ def test_a_run_is_judged_from_anywhere(monkeypatch, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     small = ["evaluate.resolution=24", "evaluate.points=500", "fit.samples=500"]
-    assert run_command(monkeypatch, str(run), *small, main=evaluate_task.main) == 0
+    assert run_command(monkeypatch, str(run), *small, task="evaluate") == 0
     assert not list((tmp_path / "elsewhere").rglob("*.safetensors")), "the store of the run was found"
 
 
 def test_the_version_is_told(monkeypatch, capsys):
-    from sdfhub.tasks.command import main
-
-    assert run_command(monkeypatch, "--version", main=main) == 0
+    assert run_command(monkeypatch, task="--version") == 0
     assert capsys.readouterr().out.split() == ["sdfhub", sdfhub.__version__]

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
@@ -27,7 +26,7 @@ from sdfhub.shapes import NORMALIZED, Frame, NormalizedMesh
 from sdfhub.tasks import reconstruct as task
 from tests.test_fitting import ball
 from tests.test_training import batches
-from tests.tiny import build_autodecoder, composed
+from tests.tiny import build_autodecoder, composed, run_command
 
 SPACE = ["scale=demo", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
 SPACE += ["encoding=none", "data.preparation.samples=4000", "data.preparation.surface_points=2000"]
@@ -252,15 +251,14 @@ def test_plain_words_name_the_run_and_the_scans(run, scans, tmp_path, monkeypatc
     shutil.copy(scans / "oriented.npz", tmp_path / "plain.npz")
     words = [str(run), str(odd / "x=1,2.npy"), str(tmp_path / "plain.npz")]
     rest = ["frame=normalised", f"out={tmp_path / 'out'}", "calibration.shapes=0"]
-    monkeypatch.setattr(sys, "argv", ["sdfhub", *words, *QUICK, *rest])
-    task.main()
+    assert run_command(monkeypatch, *words, *QUICK, *rest, task="reconstruct") == 0
     assert "unjudged" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").glob("*.ply")} == {"x=1,2.ply", "plain.ply"}
 
 
 MISTAKES = {
     "frame=metres": ["frame", "metres"],
-    "fit.nearest=-1": ["fit", "negative"],
+    "fit.nearest=-1": ["fit.nearest=-1"],
     "evidence.cells=2": ["evidence", "cells"],
     "resolution=1": ["resolution=1"],
     "sensor=[1,2]": ["sensor"],
@@ -273,20 +271,16 @@ MISTAKES = {
 @pytest.mark.parametrize("override", MISTAKES)
 def test_a_mistake_is_one_line_that_names_it(run, scans, override, monkeypatch, capsys, tmp_path):
     arguments = [f"run={run}", f"scans={scans / 'bare.npy'}", f"out={tmp_path}", override]
-    monkeypatch.setattr(sys, "argv", ["sdfhub", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        task.main()
+    status = run_command(monkeypatch, *arguments, task="reconstruct")
     message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert stop.value.code == (1 if override.startswith("scans") else 2)
+    assert status == (1 if override.startswith("scans") else 2)
     assert message.startswith("sdfhub: error: ") and all(word in message for word in MISTAKES[override])
 
 
 def test_a_fit_that_is_not_there_is_refused_with_those_that_are(run, scans, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={run}", f"scans={scans}", "fit=newton"])
-    with pytest.raises(SystemExit) as stop:
-        task.main()
+    status = run_command(monkeypatch, f"run={run}", f"scans={scans}", "fit=newton", task="reconstruct")
     message = capsys.readouterr().err
-    assert stop.value.code == 1 and "Traceback" not in message
+    assert status == 1 and "Traceback" not in message
     assert all(word in message for word in ("fit/newton", "deepsdf", "gauss_newton"))
 
 
@@ -295,12 +289,10 @@ def test_a_run_of_another_version_is_one_line(run, scans, tmp_path, monkeypatch,
     begin_run(other, {"seed": 0, "model": {}}, ["a"], [], {}, "z")
     weights = read_checkpoint(run / "checkpoints" / LAST)["state_dict"]
     write_checkpoint({"state_dict": weights}, other / "checkpoints" / LAST)
-    monkeypatch.setattr(sys, "argv", ["sdfhub", f"run={other}", f"scans={scans / 'bare.npy'}"])
-    with pytest.raises(SystemExit) as stop:
-        task.main()
+    status = run_command(monkeypatch, f"run={other}", f"scans={scans / 'bare.npy'}", task="reconstruct")
     message = capsys.readouterr().err.strip()
     assert (
-        stop.value.code == 2
+        status == 2
         and "not a shape space that this version reads" in message
         and len(message.splitlines()) == 1
     )

@@ -32,6 +32,7 @@ from sdfhub.report.tables import latex, markdown, origin, overview, tables
 from sdfhub.tasks import report as report_task
 from sdfhub.tasks.report import sheet_name, write_report
 from tests.sweep_folders import planned, score, write_cell, write_mesh
+from tests.tiny import run_command
 
 ROOT = Path(__file__).parents[1]
 
@@ -440,8 +441,7 @@ def test_a_chart_is_a_whole_svg_whatever_its_labels(tmp_path):
 def test_the_command_takes_a_folder_of_any_name_and_writes_its_files(small, monkeypatch, tmp_path, capsys):
     strange = small.rename(tmp_path / "it's, a=[sweep] $x")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["sdfhub report", str(strange), "shapes=2"])
-    report_task.main()
+    assert run_command(monkeypatch, str(strange), "shapes=2", task="report") == 0
     written = {path.name for path in (strange / "report").iterdir()}
     sheet = "sheet_table_small_procedural_chairs_cpu.png"
     assert written == {"table.md", "table.tex", "table.csv", "shapes.csv", "report.html", sheet}

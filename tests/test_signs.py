@@ -5,10 +5,9 @@ from embreex.rtcore_scene import EmbreeScene
 from manifold3d import Manifold, OpType
 
 from sdfhub.data.preparation.normalize import normalize_mesh
-from sdfhub.data.preparation.pieces import ROOM, cut_long
 from sdfhub.data.preparation.sampling import sample_points
 from sdfhub.data.preparation.settings import Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, nearest_points, winding_signs
+from sdfhub.data.preparation.signs import ROOM, SIGN_METHODS, cut_long, nearest_points, winding_signs
 from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface
 from sdfhub.geometry.morton import morton_order
 from sdfhub.geometry.sphere import sphere_directions

@@ -29,9 +29,9 @@ def variable(name: str) -> str | None:
 def test_a_stream_takes_items_one_by_one_keeps_their_order_and_survives_its_workers():
     taken = []
     items = (taken.append(number) or number for number in range(10))
-    stream = stream_in_processes(DiesElsewhere(), items, workers=1)
+    stream = stream_in_processes(DiesElsewhere(), items, workers=2)
     assert next(stream) == 0
-    assert len(taken) <= 3
+    assert len(taken) <= 5
     assert list(stream) == [number**2 for number in range(1, 10)]
 
 
@@ -44,7 +44,7 @@ def test_the_item_on_which_a_worker_dies_is_named_and_the_others_go_on():
 def test_workers_are_single_threaded_and_the_environment_here_stays(monkeypatch):
     monkeypatch.setenv(THREADS[0], "7")
     before = dict(os.environ)
-    results = dict(map_in_processes(variable, [*THREADS, *SAFE_PATH], workers=2))
+    results = dict(map_in_processes(variable, [*THREADS, SAFE_PATH], workers=2))
     assert set(results.values()) == {"1"} and dict(os.environ) == before
 
 

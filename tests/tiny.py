@@ -14,7 +14,8 @@ from sdfhub.checkpoint_file import read_checkpoint
 from sdfhub.composition import configuration_folder, instantiate
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.multirun.names import register_resolvers
-from sdfhub.tasks import train as train_task
+from sdfhub.tasks.command import main
+from sdfhub.tasks.train import make_optimisation
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -43,10 +44,10 @@ TINY = [
 ]
 
 
-def run_command(monkeypatch, *words: str, main=train_task.main) -> int:
+def run_command(monkeypatch, *words: str, task: str = "train") -> int:
     """The exit status of a command in this process."""
     GlobalHydra.instance().clear()
-    monkeypatch.setattr(sys, "argv", ["train.py", *words])
+    monkeypatch.setattr(sys, "argv", ["sdfhub", task, *words])
     try:
         main()
     except SystemExit as stop:
@@ -87,7 +88,7 @@ def build_autodecoder(config: DictConfig, rows: int):
     torch.manual_seed(config.seed)
     names = ("decoder", "codes", "loss", "computing")
     parts = {name: instantiate(config[name], name) for name in names}
-    optim = train_task.make_optimisation(config.optim)
+    optim = make_optimisation(config.optim)
     return AutoDecoder(**parts, optim=optim, shapes=rows, seed=config.seed)
 
 

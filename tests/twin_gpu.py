@@ -116,7 +116,7 @@ def evaluate(experiment: str) -> None:
     seen = []
     grid = Grid(
         lambda points, shapes: seen.append(model.decoder(points, model.codes.table[shapes])),
-        range(2), 16, 1.0, 2**20, GPU,
+        range(2), 16, 2**20, GPU,
     )  # fmt: skip
     try:
         grid.evaluate(np.arange(16**3, dtype=np.int32))

@@ -23,9 +23,9 @@ def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint whose records all have their checksums still. Runs no code of it.
+    """The content of a checkpoint whose records have their checksums still, which PyTorch does not look at.
 
-    PyTorch writes a CRC-32 of every record and does not look at it when it reads.
+    Runs no code of it.
 
     Raises:
         SdfhubError: no such file, a damaged one, or no checkpoint.

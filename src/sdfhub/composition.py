@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.errors import InstantiationException
@@ -28,10 +28,8 @@ def one_line(error: BaseException) -> str:
         return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}"
     if isinstance(error, MemoryError):
         return f"out of memory: {error}; lower resolution, points or samples"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return (lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)) or type(
-        error
-    ).__name__
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    return lines[0] if isinstance(error, OmegaConfBaseException) else " ".join(lines)
 
 
 def instantiate(config: Any, key: str, **given: Any) -> Any:
@@ -77,7 +75,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     written = lambda *words: "${oc.env:" + ",".join(map(str, words)) + "}"  # noqa: E731
     OmegaConf.register_new_resolver("oc.env", written, replace=True)
     try:
-        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     finally:
         OmegaConf.register_new_resolver("oc.env", oc.env, replace=True)
 

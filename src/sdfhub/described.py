@@ -5,16 +5,17 @@ as in a Hydra config; `_partial_` marks a factory. `describe` writes one, `built
 comes from a file: only classes of sdfhub and of packages that the caller trusts are imported for it.
 """
 
+import contextlib
 import dataclasses
 import functools
-import importlib
 import inspect
+import pkgutil
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 
@@ -31,7 +32,7 @@ class Described:
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
         if "__init__" in vars(cls):
-            cls.__init__ = _remembering(cls.__init__)
+            cls.__init__ = _remembering(cls.__init__)  # type: ignore[method-assign]
 
 
 def _remembering(initialise: Callable) -> Callable:
@@ -48,14 +49,10 @@ def _remembering(initialise: Callable) -> Callable:
 
 
 def describe(value: Any, key: str = "") -> Any:
-    """An object as plain data: numbers, strings, lists and mappings.
-
-    Args:
-        value: plain data, a class, a `functools.partial`, a dataclass or a `Described`, nested at will.
-        key: what the value is, for messages.
+    """As plain data: such data, a class, a `functools.partial`, a dataclass or a `Described`, nested.
 
     Raises:
-        SdfhubError: an object that cannot say how it was made.
+        SdfhubError: an object that cannot say how it was made; names `key`.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -65,8 +62,9 @@ def describe(value: Any, key: str = "") -> Any:
         return {str(name): describe(item, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [describe(item, key) for item in value]
-    if isinstance(value, functools.partial) and not value.args:
-        return {"_target_": _path(value.func), "_partial_": True, **describe(value.keywords, key)}
+    if isinstance(value, functools.partial):
+        named = inspect.signature(value.func).bind_partial(*value.args).arguments | value.keywords
+        return {"_target_": _path(value.func), "_partial_": True, **describe(named, key)}
     if inspect.isclass(value) or inspect.isfunction(value):
         return {"_target_": _path(value), "_partial_": True}
     if dataclasses.is_dataclass(value):
@@ -88,9 +86,9 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
 
     Args:
         node: plain data; mappings with `_target_` become objects, wherever they stand.
-        key: what the description is of, for messages.
+        key: what it is, for messages.
         trust: packages beside sdfhub whose classes may be built.
-        within: the package of sdfhub that the classes belong to.
+        within: the package of sdfhub that the others belong to.
 
     Raises:
         SdfhubError: a class of another package, an unknown or missing argument, a value of a wrong type.
@@ -99,11 +97,8 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
         return [built(item, key, trust, within) for item in node]
     if not isinstance(node, Mapping):
         return node
-    arguments = {
-        name: built(value, f"{key}.{name}", trust, within)
-        for name, value in node.items()
-        if name not in RESERVED
-    }
+    named = {name: value for name, value in node.items() if name not in RESERVED}
+    arguments = {name: built(value, f"{key}.{name}", trust, within) for name, value in named.items()}
     if "_target_" not in node:
         return arguments
     target = _trusted(node["_target_"], key, trusted_packages(trust), within)
@@ -140,19 +135,13 @@ def located(path: str, key: str) -> Callable:
     Raises:
         SdfhubError: there is none; says why it cannot be imported.
     """
-    parts, reason = str(path).split("."), "no such module"
-    for end in range(len(parts) - 1, 0, -1):
-        try:
-            target = importlib.import_module(".".join(parts[:end]))
-        except ImportError as error:
-            reason = str(error)
-            continue
-        for name in parts[end:]:
-            target = getattr(target, name, None)
+    try:
+        target = pkgutil.resolve_name(str(path))
         if callable(target):
             return target
-        reason = f"{'.'.join(parts[:end])} has none"
-        break
+        reason: object = f"it is a {type(target).__name__}"
+    except (ImportError, AttributeError, ValueError) as error:
+        reason = error
     raise SdfhubError(f"{key}: there is no class {path} ({reason}); is its package on the Python path?")
 
 
@@ -167,7 +156,11 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
     except (TypeError, ValueError):  # a class that is compiled
         return
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.values())
-    hints = _hints(target)
+    hints = {}
+    if target.__module__.partition(".")[0] != "torch":  # checks its own arguments, and annotates some wrongly
+        is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
+        with contextlib.suppress(Exception):  # an annotation that cannot be read at run time checks nothing
+            hints = typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
     for name, value in arguments.items():
         if name not in signature and not takes_any:
             known = ", ".join(signature) or "no arguments"
@@ -176,29 +169,16 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
             check(value, hints[name], f"{key}.{name}")
 
 
-def _hints(target: Callable) -> dict[str, Any]:
-    if target.__module__.partition(".")[0] in ("lightning", "torch"):
-        return {}  # they check their own arguments
-    is_class = inspect.isclass(target) and not dataclasses.is_dataclass(target)
-    try:
-        return typing.get_type_hints(target.__init__ if is_class else target, include_extras=True)
-    except Exception:  # an annotation that cannot be read at run time checks nothing
-        return {}
-
-
 def check(value: Any, hint: Any, key: str) -> Any:
     """The value as its annotation wants it; an int where a float is due is one.
 
     Raises:
         SdfhubError: it is no such value.
     """
-    lenient = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+    config = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
+    own = hasattr(hint, "__pydantic_validator__")  # a model of pydantic has a config of its own
     try:
-        adapter = TypeAdapter(hint, config=lenient)
-    except PydanticUserError:  # a model of pydantic has a config of its own
-        adapter = TypeAdapter(hint)
-    try:
-        return adapter.validate_python(value)
+        return TypeAdapter(hint, config=None if own else config).validate_python(value)
     except ValidationError as error:
         wanted = dict.fromkeys(problem["msg"].lower().removeprefix("input ") for problem in error.errors())
         raise SdfhubError(f"{key}={value!r}: {' or '.join(wanted)}") from error

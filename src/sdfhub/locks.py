@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -12,33 +12,26 @@ log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked(path: Path, patience: float = float("inf"), waiting: str | None = None) -> Iterator[bool]:
+def locked(path: Path, patience: float = -1, waiting: str | None = None) -> Iterator[bool]:
     """Holds a lock file; gives False where another process still holds it after `patience` seconds.
 
     Args:
         path: made where it is missing, in a folder that is there.
-        patience: seconds to try for.
-        waiting: logged once where the lock cannot be had at once.
+        patience: seconds to try for; -1: for ever.
+        waiting: logged where the lock cannot be had at once.
     """
     lock = FileLock(path)
-    is_held = _acquired(lock, 0)
-    if not is_held and patience > 0:
+    with suppress(Timeout):
+        lock.acquire(timeout=0)
+    if not lock.is_locked and patience:
         if waiting:
             log.info(waiting)
-        is_held = _acquired(lock, -1 if patience == float("inf") else patience)
+        with suppress(Timeout):
+            lock.acquire(timeout=patience, poll_interval=0.1)
     try:
-        yield is_held
+        yield lock.is_locked
     finally:
-        if is_held:
-            lock.release()
-
-
-def _acquired(lock: FileLock, timeout: float) -> bool:
-    try:
-        lock.acquire(timeout=timeout, poll_interval=0.1)
-    except Timeout:
-        return False
-    return True
+        lock.release()
 
 
 def is_locked(path: Path) -> bool:

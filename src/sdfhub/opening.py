@@ -84,7 +84,7 @@ def load(
 
 def write_space(space: Space, path: Path) -> None:
     """Writes a space as one file, whole or not at all."""
-    about = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
+    about: About = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
     about |= {"frames": plain_frames(space.frames), "metrics": space.metrics}
     tensors = {f"decoder.{name}": tensor for name, tensor in space.decoder.state_dict().items()}
     tensors["codes"] = space.codes
@@ -173,7 +173,7 @@ def _of_run(run: Path) -> tuple[About, dict[str, Tensor], Tensor]:
     codes = weights.pop("codes.table")
     weights = {name.removeprefix("decoder."): weight for name, weight in weights.items()}
     frames = _json(run / "frames.json", {"up": "z", "shapes": {}})
-    about = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
+    about: About = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
     about |= {"metrics": _json(run / "metrics.json", None), "up": frames["up"], "frames": frames["shapes"]}
     return about, weights, codes
 
@@ -198,11 +198,7 @@ def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         codes = tensors.pop("codes")
         weights = {name.removeprefix("decoder."): tensor for name, tensor in tensors.items()}
-        return (
-            {key: about[key] for key in ("model", "config", "ids", "frames", "up", "metrics")},
-            weights,
-            codes,
-        )
+        return about, weights, codes
     except SdfhubError:
         raise
     except Exception as error:  # the reader knows a dozen kinds of damage

@@ -4,47 +4,17 @@ import hashlib
 import json
 from typing import Any
 
-WHERE_NOT_WHAT = (
-    "ckpt_path",
-    "paths.",
-    "debug",
-    "print_config",
-    "trust",
-    "searched",
-    "logger",
-    "validation.",
-)
-WHERE_NOT_WHAT += (
-    "data.store",
-    "data.workers",
-    "data.validation",
-    "data.loader.workers",
-    "data.loader.resident",
-)
-WHERE_NOT_WHAT += ("callbacks.mesh", "callbacks.slices", "callbacks.checkpoint", "callbacks.snapshots")
-WHERE_NOT_WHAT += (
-    "callbacks.progress",
-    "callbacks.learning_rate",
-    "callbacks.stop_on_signal",
-    "hparams_search.",
-)
-WHERE_NOT_WHAT += ("computing.points_at_once", "computing.compile", "computing.tinycudann")
-WHERE_NOT_WHAT += ("evaluate.workers", "evaluate.fit_together", "evaluate.pictures", "trainer.enable_")
-WHERE_NOT_WHAT += ("trainer.log_every_n_steps", "trainer.accelerator", "trainer.devices", "trainer.strategy")
-WHERE_NOT_WHAT += (
-    "trainer.num_nodes",
-    "trainer.logger",
-    "trainer.callbacks",
-    "trainer.profiler",
-    "trainer.num_sanity",
-)
-WHERE_NOT_WHAT += (
-    "trainer.num_sanity",
-    "trainer.default_root_dir",
-    "trainer.check_val",
-    "trainer.val_check",
-    "trainer.limit_val",
-)
+_KEYS = """
+ckpt_path paths. debug print_config trust searched logger validation. data.store data.workers
+data.validation data.loader.workers data.loader.resident callbacks.mesh callbacks.slices
+callbacks.checkpoint callbacks.snapshots callbacks.progress callbacks.learning_rate
+callbacks.stop_on_signal hparams_search. computing.points_at_once computing.compile computing.tinycudann
+evaluate.workers evaluate.fit_together evaluate.pictures trainer.enable_ trainer.log_every_n_steps
+trainer.accelerator trainer.devices trainer.strategy trainer.num_nodes trainer.logger trainer.callbacks
+trainer.profiler trainer.num_sanity trainer.default_root_dir trainer.check_val trainer.val_check
+trainer.limit_val
+"""
+WHERE_NOT_WHAT = tuple(_KEYS.split())
 """Beginnings of keys that say where a run happens and how it is watched: they change no result.
 
 Other callbacks count: one that stops a training early decides its result.

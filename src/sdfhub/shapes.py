@@ -6,69 +6,49 @@ in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     import torch
 
-RADIUS = 1 / 1.03
-"""Distance of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)."""
-
+RADIUS = 1 / 1.03  # of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)
 _PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
-SHAPE_ID = rf"^{_PART}(/{_PART})*$"
-"""Pattern of a shape's id: safe as a path below a folder, and none leads out of it."""
+SHAPE_ID = rf"^{_PART}(/{_PART})*$"  # such as `chairs/0007`: a path below a folder that never leads out
 
 
 def check_id(id: str) -> None:
-    """Refuses an id that is not safe as a path below a folder, such as `chairs/0007` is.
-
-    Raises:
-        ValueError: lists the letters of an id.
-    """
+    """Raises ValueError for an id that is not safe as a path below a folder."""
     if not isinstance(id, str) or not re.fullmatch(SHAPE_ID, id):
         raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
 
 
-def _check(name: str, array, shape: tuple[int | None, ...], dtype) -> None:
-    fits = len(array.shape) == len(shape) and all(
-        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
-    )
+def _check(name: str, array: Any, shape: tuple[int | None, ...], dtype: Any) -> None:
+    fits = len(array.shape) == len(shape)
+    fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
     if not fits or array.dtype != dtype:
         raise ValueError(f"{name}: expected {list(shape)} {dtype}, got {list(array.shape)} {array.dtype}")
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh in any frame.
+    """A triangle mesh in any frame."""
 
-    Args:
-        vertices: [V, 3] float64.
-        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside; F = 0 where it is empty.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # [V, 3] float64
+    faces: np.ndarray  # [F, 3] int64 rows of vertices, counter-clockwise seen from outside; F = 0: empty
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where a shape's normalised frame lies in its source's frame.
+    """Where a shape's normalised frame lies in its source's frame."""
 
-    Args:
-        center: [3] float64, source units.
-        scale: normalised units per source unit, > 0.
-    """
+    center: np.ndarray  # [3] float64, source units
+    scale: float  # normalised units per source unit, > 0
 
-    center: np.ndarray
-    scale: float
-
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("center", self.center, (3,), np.float64)
         if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(
-                f"frame: center must be finite and scale positive, got {self.center}, {self.scale}"
-            )
+            raise ValueError(f"frame: no finite center {self.center} and positive scale {self.scale}")
 
     @classmethod
     def around(cls, points: np.ndarray) -> tuple["Frame", np.ndarray]:
@@ -93,73 +73,53 @@ class Frame:
         return (points - self.center) * self.scale
 
 
-NORMALIZED = Frame(np.zeros(3), 1.0)
-"""The frame of a shape that has no source: the normalised one itself."""
+NORMALIZED = Frame(np.zeros(3), 1.0)  # of a shape that has no source
 
 
-class _InFrame:
-    """Centre and scale of data with a frame."""
+class InFrame:
+    """Data in a normalised frame, with the centre [3] and the scale of the way back to its source's."""
 
     frame: Frame
 
     @property
     def center(self) -> np.ndarray:
-        """[3] float64, source units; `source = normalised / scale + center`."""
         return self.frame.center
 
     @property
     def scale(self) -> float:
-        """Normalised units per source unit."""
         return self.frame.scale
 
 
 @dataclass(frozen=True)
-class NormalizedMesh(_InFrame):
-    """A triangle mesh in the normalised frame.
+class NormalizedMesh(InFrame):
+    """A triangle mesh in the normalised frame."""
 
-    Args:
-        vertices: [V, 3] float64, all within the unit ball.
-        faces: [F, 3] int64, rows of `vertices`, counter-clockwise seen from outside.
-        frame: the way back to the source's frame.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # [V, 3] float64, all within the unit ball
+    faces: np.ndarray  # [F, 3] int64 rows of vertices, counter-clockwise seen from outside
     frame: Frame = NORMALIZED
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check("vertices", self.vertices, (None, 3), np.float64)
         _check("faces", self.faces, (None, 3), np.int64)
-        reach = np.linalg.norm(self.vertices, axis=1).max(initial=0)
-        if not reach <= 1 + 1e-6:  # also where a vertex is not finite
+        if not np.linalg.norm(self.vertices, axis=1).max(initial=0) <= 1 + 1e-6:  # also where one is NaN
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise ValueError("faces: index a vertex that is not there")
 
 
 @dataclass(frozen=True)
-class ShapeSamples(_InFrame):
-    """Signed distances and oriented surface points of one shape, normalised frame.
+class ShapeSamples(InFrame):
+    """Signed distances and oriented surface points of one shape, normalised frame."""
 
-    Args:
-        points: [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little.
-        sdf: [N] float32, negative inside.
-        surface_points: [M, 3] float32; M = 0 where the source has none.
-        surface_normals: [M, 3] float32, unit length, outward.
-        frame: the way back to the source's frame.
-        mesh: the oriented faces from which the samples were taken, or None (DeepSDF's npz have none).
-        statistics: numbers about the preparation (two-sided area, inside fraction, ...).
-    """
-
-    points: np.ndarray
-    sdf: np.ndarray
-    surface_points: np.ndarray
-    surface_normals: np.ndarray
+    points: np.ndarray  # [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little
+    sdf: np.ndarray  # [N] float32, negative inside
+    surface_points: np.ndarray  # [M, 3] float32; M = 0 where the source has none
+    surface_normals: np.ndarray  # [M, 3] float32, unit length, outward
     frame: Frame
-    mesh: NormalizedMesh | None
-    statistics: dict[str, float]
+    mesh: NormalizedMesh | None  # the oriented faces that were sampled; DeepSDF's npz have none
+    statistics: dict[str, float]  # of the preparation (two-sided area, inside fraction, ...)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n, m = len(self.points), len(self.surface_points)
         shapes = {"points": (n, 3), "sdf": (n,), "surface_points": (m, 3), "surface_normals": (m, 3)}
         for name, shape in shapes.items():
@@ -172,29 +132,20 @@ class ShapeSamples(_InFrame):
 
 @dataclass(frozen=True)
 class Observation:
-    """Bounds on the signed distances of one shape at some points.
+    """Bounds on the signed distances of one shape at some points, in random order.
 
     A sample of the field has equal bounds; a point on the surface has 0 and 0; a point that a ray crossed
-    has 0 or more below; any point has its distance to the observed surface above. Where no side is known,
-    the bounds are those of the unsigned distance.
-
-    Args:
-        points: [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity); in random order.
-        low: [N] float32, least signed distance there.
-        high: [N] float32, largest; high >= low.
-        unsigned: [N] bool, whether low and high bound the absolute value.
-        noise: standard deviation of the surface points, same frame, >= 0.
-        partial: whether a part of the shape's surface was not seen.
+    has 0 or more below; any point has its distance to the observed surface above.
     """
 
-    points: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    unsigned: np.ndarray
-    noise: float = 0.0
-    partial: bool = False
+    points: np.ndarray  # [N, 3] float32, N > 0, normalised frame (or that of an unknown similarity)
+    low: np.ndarray  # [N] float32, least signed distance
+    high: np.ndarray  # [N] float32, largest
+    unsigned: np.ndarray  # [N] bool, whether low and high bound the absolute value, since no side is known
+    noise: float = 0.0  # standard deviation of the surface points, same frame, >= 0
+    partial: bool = False  # whether a part of the shape's surface was not seen
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         n = len(self.points)
         _check("points", self.points, (n, 3), np.float32)
         for name, dtype in (("low", np.float32), ("high", np.float32), ("unsigned", np.bool_)):
@@ -207,8 +158,7 @@ class Observation:
     @classmethod
     def of_samples(cls, points: np.ndarray, sdf: np.ndarray) -> "Observation":
         """Signed samples: points [N, 3] and their distances [N], in random order."""
-        sdf = np.ascontiguousarray(sdf, np.float32)
-        points = np.ascontiguousarray(points, np.float32)
+        sdf, points = np.ascontiguousarray(sdf, np.float32), np.ascontiguousarray(points, np.float32)
         return cls(points, sdf, sdf, np.zeros(len(sdf), np.bool_))
 
     @property
@@ -220,23 +170,15 @@ class Observation:
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of B shapes for one training step, normalised frame; the shape axis is kept.
+    """Samples of B shapes for one training step, normalised frame; the shape axis is kept."""
 
-    Args:
-        rows: [B] int64, row of each shape in the code table.
-        points: [B, N, 3] float32.
-        sdf: [B, N] float32, negative inside.
-        surface_points: [B, M, 3] float32; M = 0 without normals.
-        surface_normals: [B, M, 3] float32, unit length, outward.
-    """
+    rows: "torch.Tensor"  # [B] int64, row of each shape in the code table
+    points: "torch.Tensor"  # [B, N, 3] float32
+    sdf: "torch.Tensor"  # [B, N] float32, negative inside
+    surface_points: "torch.Tensor"  # [B, M, 3] float32; M = 0 without normals
+    surface_normals: "torch.Tensor"  # [B, M, 3] float32, unit length, outward
 
-    rows: "torch.Tensor"
-    points: "torch.Tensor"
-    sdf: "torch.Tensor"
-    surface_points: "torch.Tensor"
-    surface_normals: "torch.Tensor"
-
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         import torch  # here: meshes and samples do without it
 
         b, n = self.points.shape[:2]
@@ -246,6 +188,6 @@ class Batch:
         for name, count in (("points", n), ("surface_points", m), ("surface_normals", m)):
             _check(name, getattr(self, name), (b, count, 3), torch.float32)
 
-    def to(self, device, non_blocking: bool = False) -> "Batch":
+    def to(self, device: "torch.device | str", non_blocking: bool = False) -> "Batch":
         """The same batch on another device."""
         return Batch(*(getattr(self, f).to(device, non_blocking=non_blocking) for f in self.__match_args__))

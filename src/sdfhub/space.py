@@ -96,7 +96,7 @@ class Space:
         """Where the codes and the decoder are."""
         return self.codes.device
 
-    def row(self, shape: str | int) -> int:
+    def row(self, shape: str | int | np.integer) -> int:
         """The row of a shape in the code table.
 
         Raises:
@@ -123,14 +123,14 @@ class Space:
         if isinstance(shape, Sequence):
             if not shape:
                 raise SdfhubError("no shape is named")
-            return torch.stack([self._code_of_one(one) for one in shape])
+            return torch.stack([self._single_code(item) for item in shape])
         code = self._tensor(shape)
         if code.dim() not in (1, 2) or code.shape[-1] != self.codes.shape[1]:
             what = f"a code is an array or tensor of {self.codes.shape[1]} numbers"
             raise SdfhubError(f"a shape is an id, a row or a code, and {what}; got {list(code.shape)}")
         return code
 
-    def _code_of_one(self, shape: Shape) -> Tensor:
+    def _single_code(self, shape: Shape) -> Tensor:
         code = self.code(shape)
         if code.dim() != 1:
             raise SdfhubError("expected one shape, got several")
@@ -138,8 +138,9 @@ class Space:
 
     def frame(self, shape: Shape) -> Frame:
         """Where a shape lies in its source's frame; the normalised frame itself where that is not known."""
-        is_named = isinstance(shape, str | int | np.integer)
-        return self.frames.get(self.ids[self.row(shape)], NORMALIZED) if is_named else NORMALIZED
+        if not isinstance(shape, str | int | np.integer):
+            return NORMALIZED
+        return self.frames.get(self.ids[self.row(shape)], NORMALIZED)
 
     def sdf(self, points: Array, shape: Shape | Sequence[Shape]) -> Tensor:
         """Signed distances [N] at points [N, 3] of one shape, or [B, N] at [B, N, 3] of B; negative inside.
@@ -161,8 +162,8 @@ class Space:
         if not points.numel():
             return points.new_zeros(points.shape[1:-1] if is_one else points.shape[:-1])
         differentiated = torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)
-        found = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
-        return found[0] if is_one else found
+        sdf = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
+        return sdf[0] if is_one else sdf
 
     def mesh(self, shape: Shape, resolution: int = 256) -> Mesh:
         """The surface of a shape, in its source's frame or, where a code has none, the normalised one.
@@ -181,9 +182,9 @@ class Space:
         codes = self.code(shapes)
         if codes.dim() != 2:
             raise SdfhubError("meshes: takes several shapes, a list or codes [S, L]; mesh takes one")
-        found = reconstruct(self.decoder, codes, resolution)
-        for shape, (vertices, faces) in zip(shapes, found, strict=True):
-            yield self.frame(shape).to_source(vertices), faces
+        meshes = reconstruct(self.decoder, codes, resolution)
+        for shape, (vertices, faces) in zip(shapes, meshes, strict=True):
+            yield Mesh(self.frame(shape).to_source(vertices), faces)
 
     def fit(
         self,
@@ -209,7 +210,7 @@ class Space:
         if sdf is not None and normals is not None:
             raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
         try:
-            scan = Scan(_numbers(points), _numbers(normals), sdf=_numbers(sdf))
+            scan = Scan(_numbers(points), normals=_numbers(normals), sdf=_numbers(sdf))
             return self.fit_scan(scan, frame, seed)
         except (TypeError, ValueError, SdfhubError) as error:
             raise SdfhubError(f"fit: {error}") from error
@@ -241,17 +242,17 @@ class Space:
         """Codes [steps, L] in equal steps along the line from a to b, both included; steps >= 2."""
         _check_count("steps", steps, 2)
         share = torch.linspace(0, 1, steps, device=self.device)[:, None]
-        return torch.lerp(self._code_of_one(a)[None], self._code_of_one(b)[None], share)
+        return torch.lerp(self._single_code(a)[None], self._single_code(b)[None], share)
 
     def neighbours(self, shape: Shape, k: int = 5) -> list[tuple[str, float]]:
         """Ids of the k shapes with the nearest codes, and how far they are; a shape is not its own."""
         _check_count("k", k, 1)
-        distances = (self.codes - self._code_of_one(shape).detach()).norm(dim=1)
+        distances = (self.codes - self._single_code(shape).detach()).norm(dim=1)
         if isinstance(shape, str | int | np.integer):
             distances[self.row(shape)] = torch.inf
         values, rows = distances.topk(min(k, len(self.ids)), largest=False)
-        found = zip(rows.tolist(), values.tolist(), strict=True)
-        return [(self.ids[row], value) for row, value in found if np.isfinite(value)]
+        nearest = zip(rows.tolist(), values.tolist(), strict=True)
+        return [(self.ids[row], value) for row, value in nearest if np.isfinite(value)]
 
     def unusual(self, shape: Shape | Sequence[Shape]) -> Tensor:
         """How far codes lie from the middle of the known ones, [] or [B]: about 1 for these.
@@ -289,7 +290,7 @@ def _check_count(name: str, value: int, least: int) -> None:
         raise SdfhubError(f"{name}={value!r}: must be a whole number, at least {least}")
 
 
-def _numbers(array: Array | None) -> np.ndarray | None:
+def _numbers(array: Any) -> Any:
     return None if array is None else torch.as_tensor(_contiguous(array)).detach().cpu().double().numpy()
 
 

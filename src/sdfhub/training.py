@@ -13,7 +13,7 @@ from sdfhub.described import trusted_packages
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import load
 from sdfhub.space import Space
-from sdfhub.tasks.train import train as train_into
+from sdfhub.tasks.train import train_into
 
 
 def train(overrides: Sequence[str] = (), trust: str | Sequence[str] = ()) -> Space:

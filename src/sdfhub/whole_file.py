@@ -18,8 +18,8 @@ def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
 
     Args:
         path: its folder is made where it is missing.
-        beside: name under which it is written first; None takes a new one. A fixed name keeps what killed
-            writers leave from piling up; only one process may then write at a time.
+        beside: name under which it is written first; None takes a new one. A fixed name keeps leftovers of
+            killed writers from piling up; only one process may then write at a time.
 
     Raises:
         OSError: the disk is full or the folder cannot be written; names `path`, which stays as it was.
@@ -49,11 +49,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 def refuse_unwritable(folder: Path) -> None:
-    """Makes a folder of results, before hours go into what should lie there.
-
-    Raises:
-        SdfhubError: nothing can be written there.
-    """
+    """Makes a folder of results; raises SdfhubError where nothing can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

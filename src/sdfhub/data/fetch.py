@@ -17,18 +17,16 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import IO
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 
 log = logging.getLogger(__name__)
 
+# Debian packages and the suffix of the meshes in them; nothing else of them is unpacked
 PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
-"""Debian packages and the suffix of the meshes in them; nothing else of them is unpacked."""
-
-MAX_MEMBER = 256 << 20
-MAX_TOTAL = 2 << 30
+MAX_MEMBER, MAX_TOTAL = 256 << 20, 2 << 30
 
 
 def fetch(root: str | Path) -> None:
@@ -44,7 +42,6 @@ def fetch(root: str | Path) -> None:
             shutil.rmtree(leftover, ignore_errors=True)
         for package, suffix in PACKAGES.items():
             if any(root.rglob(f"*{suffix}")):
-                log.info("%s: is in %s", package, root)
                 continue
             with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
                 archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
@@ -55,24 +52,23 @@ def fetch(root: str | Path) -> None:
 
 
 def unpack(archive: Path, folder: Path, suffix: str) -> int:
-    """Unpacks a .deb's regular files that end in `suffix`, and its copyright file; returns their number.
-
-    Raises:
-        SdfhubError: not a whole .deb, or one that holds no such file or unreasonably large ones.
-    """
+    """Unpacks a .deb's regular files that end in `suffix`, and its copyright file; returns their number."""
     count, total = 0, 0
     try:
         with _data_tar(archive) as stream, tarfile.open(fileobj=stream, mode="r|") as tar:
             for member in tar:
-                if not _is_wanted(member, suffix):
+                path = PurePosixPath(member.name)
+                is_inside = member.isreg() and not path.is_absolute() and ".." not in path.parts
+                if not is_inside or (path.suffix.lower() != suffix and path.name != "copyright"):
                     continue
                 total += member.size
                 if member.size > MAX_MEMBER or total > MAX_TOTAL:
                     raise SdfhubError(f"{archive}: {member.name} is larger than anything expected of it")
-                target = folder.joinpath(*PurePosixPath(member.name).parts)
+                target, content = folder.joinpath(*path.parts), tar.extractfile(member)
+                assert content, "a regular file"
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("wb") as file:
-                    shutil.copyfileobj(tar.extractfile(member), file)
+                    shutil.copyfileobj(content, file)
                 count += 1
     except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
         what = f"{archive}: not a whole .deb ({error}); delete it and download it again"
@@ -82,18 +78,13 @@ def unpack(archive: Path, folder: Path, suffix: str) -> int:
     return count
 
 
-def _is_wanted(member: tarfile.TarInfo, suffix: str) -> bool:
-    path = PurePosixPath(member.name)
-    is_inside = not path.is_absolute() and ".." not in path.parts
-    return member.isreg() and is_inside and (path.suffix.lower() == suffix or path.name == "copyright")
-
-
 @contextmanager
-def _data_tar(archive: Path) -> Iterator[BinaryIO]:
+def _data_tar(archive: Path) -> Iterator[IO[bytes]]:
     """The uncompressed data.tar of a .deb as a stream."""
     if shutil.which("dpkg-deb"):  # reads every compression that Debian and Ubuntu use
         command = ["dpkg-deb", "--fsys-tarfile", str(archive)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+            assert process.stdout
             yield process.stdout
             shutil.copyfileobj(process.stdout, io.BytesIO())  # the padding after the last member
         if process.returncode:
@@ -121,33 +112,21 @@ def _archive_by_hand(root: Path, package: str) -> Path | None:
 
 def _download(package: str, scratch: Path, root: Path) -> Path:
     """Downloads a package by apt-get into `scratch`, with package lists of our own where there are none."""
-    if not shutil.which("apt-get"):
-        raise SdfhubError(_by_hand(package, root, "this is no Debian or Ubuntu"))
-    if _apt(scratch, "download", package):
+    problem = "this is no Debian or Ubuntu"
+    if shutil.which("apt-get"):
+        problem = "apt-get fails"
         (scratch / "lists" / "partial").mkdir(parents=True)
         private = ["-o", f"Dir::State::Lists={scratch / 'lists'}", "-o", f"Dir::Cache={scratch}"]
-        problem = _apt(scratch, *private, "update") or _apt(scratch, *private, "download", package)
-        if problem:
-            raise SdfhubError(_by_hand(package, root, f"apt-get: {problem}"))
-    return _archive_by_hand(scratch, package)
-
-
-def _apt(folder: Path, *arguments: str) -> str:
-    """Runs apt-get in `folder`; returns the last line of its complaint, empty when all went well."""
-    # apt hands downloads to a user of its own, who may not enter our folder
-    command = ["apt-get", "-q", "-o", "APT::Sandbox::User=", *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    lines = [line for line in done.stderr.splitlines() if line.startswith("E:")] or done.stderr.splitlines()
-    is_there = "download" not in arguments or _archive_by_hand(folder, arguments[-1])
-    if done.returncode == 0 and is_there:
-        return ""
-    return lines[-1] if lines else f"status {done.returncode}"
-
-
-def _by_hand(package: str, root: Path, why: str) -> str:
+        for command in (["download", package], [*private, "update"], [*private, "download", package]):
+            # apt hands downloads to a user of its own, who may not enter our folder
+            command = ["apt-get", "-q", "-o", "APT::Sandbox::User=", *command]
+            done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
+            if archive := _archive_by_hand(scratch, package):
+                return archive
+            problem = next((line for line in done.stderr.splitlines() if line.startswith("E:")), problem)
     files = " and ".join(f"{name}_*_all.deb" for name in PACKAGES)
     advice = f"get {files} from Debian's package pages, put them into {root} and run this again"
-    return f"{package} is not in {root} and cannot be downloaded ({why}); {advice}"
+    raise SdfhubError(f"{package} is not in {root} and cannot be downloaded ({problem}); {advice}")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,15 +2,14 @@
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import chain, zip_longest
+from typing import NamedTuple
 
 from sdfhub.data.sources.source import Shape
 from sdfhub.errors import SdfhubError
 
 
-@dataclass(frozen=True)
-class Split:
+class Split(NamedTuple):
     """Training and held-out shapes; no shape is in both."""
 
     train: list[Shape]
@@ -27,8 +26,7 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
 
     Args:
         shapes: what the source offers; the order does not matter.
-        train: number of training shapes; None takes all that are not held out.
-        held_out: number of held-out shapes.
+        train, held_out: numbers of shapes; None trains on all that are not held out.
         seed: another seed, another order.
         at_most: the numbers are upper bounds. Where there are not enough shapes, or all are trained on, no
             more than a fifth of them is held out, but one of three.
@@ -36,7 +34,7 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
     Raises:
         SdfhubError: fewer shapes than asked for; with `at_most`, none to train on.
     """
-    if held_out < 0 or (train is not None and train < 0):
+    if min(held_out, train or 0) < 0:
         raise SdfhubError(f"split: the numbers of shapes must not be negative, got {train} and {held_out}")
     ordered = sorted(shapes, key=lambda shape: hashlib.sha256(f"{seed}:{shape.id}".encode()).digest())
     free = [shape for shape in ordered if shape.split is None]
@@ -49,7 +47,11 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
     rest = [shape for shape in _evenly(reversed(pool)) if shape.id not in taken]
     is_short = len(chosen) < held_out or len(rest) < (train or 0)
     if (is_short and not at_most) or (not rest and train != 0):
-        raise SdfhubError(_too_few(shapes, train, held_out))
+        roles = [shape.split for shape in shapes]
+        given = f" ({roles.count('train')} train and {roles.count('held_out')} held out by the split file)"
+        asked = f"{'all others' if train is None else train} to train on and {held_out} to hold out"
+        there = f"{len(shapes)}{given if any(roles) else ''}"
+        raise SdfhubError(f"too few shapes: {asked} are asked for, there are {there}")
     return Split(train=rest[:train], held_out=chosen)
 
 
@@ -60,11 +62,3 @@ def _evenly(shapes: Iterable[Shape]) -> list[Shape]:
         by_category.setdefault(shape.category, []).append(shape)
     rounds = zip_longest(*(by_category[name] for name in sorted(by_category)))
     return [shape for shape in chain.from_iterable(rounds) if shape is not None]
-
-
-def _too_few(shapes: list[Shape], train: int | None, held_out: int) -> str:
-    asked = "all others" if train is None else str(train)
-    roles = [shape.split for shape in shapes]
-    given = f" ({roles.count('train')} train and {roles.count('held_out')} held out by the split file)"
-    there = f"{len(shapes)}{given if any(roles) else ''}"
-    return f"too few shapes: {asked} to train on and {held_out} to hold out are asked for, there are {there}"

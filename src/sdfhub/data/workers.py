@@ -13,30 +13,26 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
+from typing import Any
 
 from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
+# what tells the numeric libraries how many threads to start; read when they are imported
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
-"""What tells the numeric libraries how many threads to start; read when they are imported."""
-
-SAFE_PATH = {"PYTHONSAFEPATH": "1"}
-"""Keeps Python from importing modules of the current folder."""
+SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing modules of the current folder
 
 
 class Crashed:
     """The result of an item whose worker process died (out of memory, a fault in a native library)."""
 
 
-def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[tuple[int, object]]:
-    """(index, function(item)) of each item, in the order in which they end.
+def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[tuple[int, Any]]:
+    """(index, function(item)) of each item, in the order in which they end; `Crashed` where a worker died.
 
     Args:
         function: picklable; its exceptions are raised here.
         items: picklable.
         workers: processes, each with one thread.
-
-    Yields:
-        Index and result; `Crashed` in place of the result where the worker died on that item.
     """
     left = dict(enumerate(items))
     while left:
@@ -53,89 +49,69 @@ def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[
                     yield index, Crashed()
 
 
-def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[object]:
+def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[Any]:
     """function(item) of each item, in their order, computed while the caller makes the next items.
 
     At most two items a worker wait. Where a worker dies, what is left is computed here.
 
     Args:
-        function: picklable; its exceptions are raised here.
-        items: picklable; taken one by one.
-        workers: processes, as in `map_in_processes`; 0 for none but this one.
+        function, items: as for `map_in_processes`; items are taken one by one.
+        workers: processes; below 2 for none but this one.
     """
-    if workers < 1:
+    if workers < 2:
         yield from map(function, items)
         return
-    waiting: deque[tuple[object, Future | None]] = deque()
+    waiting: deque[tuple[Any, Future | None]] = deque()
     with _pool(function, workers) as pool:
         for item in items:
-            waiting.append((item, _submitted(pool, item)))
+            try:
+                waiting.append((item, pool.submit(_call, item)))
+            except BrokenProcessPool:
+                waiting.append((item, None))
             if len(waiting) > 2 * workers:
                 yield _result(function, *waiting.popleft())
         while waiting:
             yield _result(function, *waiting.popleft())
 
 
-def workers_worth(items: int, each: int) -> int:
-    """Worker processes for so many items where one pays for `each`; 0, for none, where it would be one."""
-    workers = min(os.cpu_count() or 1, items // each)
-    return workers if workers > 1 else 0
-
-
-def _in_pool(function: Callable, items: dict[int, object], workers: int) -> Iterator[tuple[int, object]]:
+def _in_pool(function: Callable, items: dict[int, Any], workers: int) -> Iterator[tuple[int, Any]]:
     with _pool(function, workers) as pool:
         futures = {pool.submit(_call, item): index for index, item in items.items()}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
 
-def _submitted(pool: ProcessPoolExecutor, item: object) -> Future | None:
+def _result(function: Callable, item: Any, future: Future | None) -> Any:
     try:
-        return pool.submit(_call, item)
-    except BrokenProcessPool:
-        return None
-
-
-def _result(function: Callable, item: object, future: Future | None) -> object:
-    try:
-        return function(item) if future is None else future.result()
+        return future.result() if future else function(item)
     except BrokenProcessPool:
         return function(item)
 
 
 @contextmanager
 def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
-    with _safe_path():  # for the processes that clean up after the workers; started once
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"  # for the processes that clean up after the workers; started once
+    try:
         resource_tracker.ensure_running()
-        pool = ProcessPoolExecutor(
-            workers,
-            env=dict.fromkeys(THREADS, "1") | SAFE_PATH,
-            initializer=_start,
-            initargs=(function, os.getpid()),
-        )
+        env, arguments = dict.fromkeys((*THREADS, SAFE_PATH), "1"), (function, os.getpid())
+        pool = ProcessPoolExecutor(workers, env=env, initializer=_start, initargs=arguments)
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
     try:
         yield pool
     finally:
         pool.shutdown(kill_workers=True)
 
 
-@contextmanager
-def _safe_path() -> Iterator[None]:
-    before = {key: os.environ[key] for key in SAFE_PATH if key in os.environ}
-    os.environ.update(SAFE_PATH)
-    try:
-        yield
-    finally:
-        for key in SAFE_PATH.keys() - before:
-            del os.environ[key]
-        os.environ.update(before)
-
-
-_function: Callable | None = None
+_function: Callable
 """Of a worker process: handed over once, since a source with its list of files may be large."""
 
 
-def _call(item: object) -> object:
+def _call(item: Any) -> Any:
     return _function(item)
 
 

@@ -1,7 +1,6 @@
 """What a training ran with: versions and hardware, kept beside its scores so that both can be told."""
 
 import platform
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,7 +14,7 @@ def made_with(trainer: Trainer) -> dict[str, str]:
     """Versions, the device that trained, its threads or processes, and the precision; plain text by name."""
     device = trainer.strategy.root_device
     return {
-        "python": ".".join(map(str, sys.version_info[:3])),
+        "python": platform.python_version(),
         **{name: version(name) for name in PACKAGES},
         "system": f"{platform.system()} {platform.machine()}",
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
@@ -27,9 +26,7 @@ def made_with(trainer: Trainer) -> dict[str, str]:
 
 def _processor() -> str:
     """The processor's name; Python itself knows it on few systems."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or "unknown"

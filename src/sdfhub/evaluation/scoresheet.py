@@ -1,13 +1,9 @@
-"""What an evaluation found, for readers: table, `metrics.json`, `metrics.csv`, meshes, contact sheet."""
+"""What an evaluation measured, for readers: table, `metrics.json`, `metrics.csv`, meshes, contact sheet."""
 
-import csv
-import dataclasses
-import io
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +13,39 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
-from sdfhub.geometry.metrics import ShapeMetrics, summarize
+from sdfhub.geometry.metrics import STATISTICS, ShapeMetrics, summarize
 from sdfhub.geometry.render import render
+from sdfhub.geometry.up_axis import UpAxis
+from sdfhub.shapes import NormalizedMesh
 from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
 COLUMNS = {
-    "cd": "CD x10^3",
-    "floor": "floor",
-    "excess": "excess",
-    "normal_consistency": "normals",
-    "f_score": "F-score",
+    "cd": ("CD x10^3", 1e3),
+    "floor": ("floor", 1e3),
+    "excess": ("excess", 1e3),
+    "normal_consistency": ("normals", 1),
+    "f_score": ("F-score", 1),
+    "sdf_error": ("|f-d| x10^3", 1e3),
+    "sign_accuracy": ("signs right", 1),
 }
-"""Metrics of the printed table and their headings; the files carry all of them."""
+"""Metrics of the printed table, their headings and factors; the files carry all of them, without factors."""
+
+TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
+
+
+@dataclass(frozen=True)
+class DistanceMetrics:
+    """The judgement of a field where the source has no mesh.
+
+    Args:
+        sdf_error: mean |f - d| over samples with |d| < delta, normalised units.
+        sign_accuracy: share of samples on the right side.
+    """
+
+    sdf_error: float
+    sign_accuracy: float
 
 
 @dataclass(frozen=True)
@@ -46,26 +61,25 @@ class Judged:
 
     role: str
     shape: StoredShape
-    metrics: ShapeMetrics
-    pictures: tuple[np.ndarray, np.ndarray | str] | None
+    metrics: ShapeMetrics | DistanceMetrics
+    pictures: tuple[np.ndarray, np.ndarray | str] | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether the reconstruction has no surface."""
+        return isinstance(self.metrics, ShapeMetrics) and self.metrics.failed
 
 
 def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -> None:
-    """Writes a reconstruction below `meshes/`, in the frame of the source's own meshes.
-
-    Args:
-        role, shape: of which it is one.
-        mesh: normalised frame; nothing is written where it has no faces.
-        out: folder of the results.
-    """
+    """Writes a reconstruction in the normalised frame below `out`/meshes, in that of the source's meshes."""
     vertices, faces = mesh
-    write_mesh(vertices / shape.scale + shape.center, faces, out / "meshes" / role / f"{shape.id}.ply")
+    write_mesh(shape.frame.to_source(vertices), faces, out / "meshes" / role / f"{shape.id}.ply")
 
 
-def pictured(shape: StoredShape, mesh: Mesh) -> tuple[np.ndarray, np.ndarray | str]:
+def pictured(truth: NormalizedMesh, mesh: Mesh, up: UpAxis) -> tuple[np.ndarray, np.ndarray | str]:
     """Pictures of a shape and of its reconstruction, normalised frame."""
-    truth = render(shape.mesh.vertices, shape.mesh.faces, up=shape.up)
-    return truth, render(*mesh, up=shape.up) if len(mesh[1]) else "no surface"
+    reconstruction = render(*mesh, up=up) if len(mesh.faces) else "no surface"
+    return render(truth.vertices, truth.faces, up=up), reconstruction
 
 
 def write_scores(
@@ -82,99 +96,65 @@ def write_scores(
     Returns:
         What `metrics.json` holds: the settings and, per role, a `summary` and the rows of its `shapes`.
     """
-    result: dict[str, Any] = {"evaluation": dataclasses.asdict(evaluation), "training": training}
-    for role in dict.fromkeys(row.role for row in judged):
-        rows = [row for row in judged if row.role == role]
-        shapes = [{"id": row.shape.id, **dataclasses.asdict(row.metrics)} for row in rows]
-        result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
-    write_whole(out / "metrics.csv", _csv(judged))
-    if shown := [row for row in judged if row.pictures]:
-        _write_sheet(shown, out / "contact_sheet.png")
-    write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
+    import pandas  # here: slow to import, and every training would wait for it before its first step
+
+    result: dict[str, Any] = {"evaluation": asdict(evaluation), "training": training}
+    for role, rows in _by_role(judged).items():
+        shapes = [{"id": row.shape.id, **asdict(row.metrics)} for row in rows]
+        result[role] = {"summary": _summary(rows), "shapes": shapes}
+    table_rows = [{"role": row.role, "id": row.shape.id, **asdict(row.metrics)} for row in judged]
+    write_whole(out / "metrics.csv", pandas.DataFrame(table_rows).to_csv(index=False))
     log.info(table(judged))
-    if judged:
+    if any(not isinstance(row.metrics, ShapeMetrics) for row in judged):
+        log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
+    else:
         log.info("\nmeshes:        %s", out / "meshes")
-    if shown:
-        log.info("contact sheet: %s", out / "contact_sheet.png")
+    if pictures := [row.pictures for row in judged if row.pictures]:
+        captions = [f"{row.shape.id}\n{_title(row)}" for row in judged if row.pictures]
+        sheet = list(zip(*pictures, strict=True))
+        path = contact_sheet(sheet, ["ground truth", "reconstruction"], captions, out / "contact_sheet.png")
+        log.info("contact sheet: %s", path)
+    # last: a run that has it is finished
+    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
     log.info("metrics:       %s", out / "metrics.json")
     return result
+
+
+def _summary(rows: Sequence[Judged]) -> dict[str, Any]:
+    shapes = [row.metrics for row in rows if isinstance(row.metrics, ShapeMetrics)]
+    if len(shapes) == len(rows):
+        return summarize(shapes)
+    summary = {}
+    for name in asdict(rows[0].metrics):
+        values = [getattr(row.metrics, name) for row in rows]
+        summary[name] = {key: float(statistic(values)) for key, statistic in STATISTICS.items()}
+    return summary
 
 
 def table(judged: Sequence[Judged]) -> str:
-    """The Chamfer table: a line a shape, then mean and median, known and held-out shapes apart."""
-    width = max([len(row.shape.id) for row in judged] + [len("90th percentile")]) + 2
-    lines = []
-    for role in dict.fromkeys(row.role for row in judged):
-        rows = [row for row in judged if row.role == role]
-        title = "training shapes" if role == "train" else "held-out shapes"
-        lines += ["", f"{title:<{width}}" + "".join(f"{heading:>11}" for heading in COLUMNS.values())]
-        lines += [f"{row.shape.id:<{width}}{_cells(row.metrics)}" for row in rows]
-        whole = [row.metrics for row in rows if not row.metrics.failed]
-        statistics = {"mean": np.mean, "median": np.median, "90th percentile": partial(np.quantile, q=0.9)}
-        for name, statistic in statistics.items() if whole else ():
-            values = {key: float(statistic([getattr(m, key) for m in whole])) for key in COLUMNS}
-            lines.append(f"{name:<{width}}" + "".join(_number(key, values[key]) for key in COLUMNS))
-        lines.append(f"{'without surface':<{width}}{len(rows) - len(whole):>11} of {len(rows)}")
-    return "\n".join(lines)
+    """A line a shape, then mean, median and 90th percentile, training and held-out shapes apart."""
+    import pandas
+
+    blocks = []
+    for role, rows in _by_role(judged).items():
+        scores = pandas.DataFrame([asdict(row.metrics) for row in rows], [row.shape.id for row in rows])
+        columns = {name: column for name, column in COLUMNS.items() if name in scores}
+        frame = scores[list(columns)].astype(float) * [factor for _, factor in columns.values()]
+        failed = [row.failed for row in rows]
+        frame.columns = pandas.Index([heading for heading, _ in columns.values()], name=TITLES[role])
+        frame.loc[failed] = np.nan
+        summary = frame.agg(["mean", "median"])
+        summary.loc["90th percentile"] = frame.quantile(0.9)
+        text = pandas.concat([frame, summary]).to_string(float_format="{:.4f}".format, na_rep="-")
+        blocks.append(f"{text}\nwithout surface: {sum(failed)} of {len(rows)}")
+    return "\n\n".join(blocks)
 
 
-def _cells(metrics: ShapeMetrics) -> str:
-    if metrics.failed:
-        return f"{'no surface':>11}"
-    return "".join(_number(key, getattr(metrics, key)) for key in COLUMNS)
-
-
-def _number(key: str, value: float) -> str:
-    thousandfold = key in ("cd", "floor", "excess")
-    return f"{value * 1e3 if thousandfold else value:>11.4f}"
-
-
-def _csv(judged: Sequence[Judged]) -> str:
-    fields = [field.name for field in dataclasses.fields(ShapeMetrics)]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["role", "id", *fields])
-    for row in judged:
-        writer.writerow([row.role, row.shape.id, *(getattr(row.metrics, field) for field in fields)])
-    return text.getvalue()
-
-
-def _write_sheet(shown: Sequence[Judged], path: Path) -> None:
-    """Ground truth above reconstruction; CD times 10^3, as in the table."""
-    captions = [f"{row.shape.id}\n{_title(row)}" for row in shown]
-    pictures = list(zip(*(row.pictures for row in shown), strict=True))
-    contact_sheet(pictures, ["ground truth", "reconstruction"], captions, path)
+def _by_role(judged: Sequence[Judged]) -> dict[str, list[Judged]]:
+    roles = dict.fromkeys(row.role for row in judged)
+    return {role: [row for row in judged if row.role == role] for role in roles}
 
 
 def _title(row: Judged) -> str:
-    cd = "no surface" if row.metrics.failed else f"CD {row.metrics.cd * 1e3:.3f}"
-    return f"{row.role.replace('_', '-')}, {cd}"
-
-
-def write_distances(
-    rows: Sequence[tuple[str, StoredShape, dict[str, float]]], training: dict[str, Any] | None, out: Path
-) -> dict[str, Any]:
-    """The scores of shapes without a mesh: `metrics.json`, `metrics.csv` and a printed table.
-
-    Args:
-        rows: role, shape and its distance errors; at least one.
-        training: plain numbers about the training; None where nothing was trained.
-        out: folder of the results.
-    """
-    result: dict[str, Any] = {"training": training}
-    lines, heads = [["role", "id", *rows[0][2]]], list(rows[0][2])
-    for role, shape, errors in rows:
-        entry = result.setdefault(role, {"summary": {}, "shapes": []})
-        entry["shapes"].append({"id": shape.id, **errors})
-        lines.append([role, shape.id, *errors.values()])
-    for entry in (result[role] for role in dict.fromkeys(row[0] for row in rows)):
-        for head in heads:
-            values = [row[head] for row in entry["shapes"]]
-            entry["summary"][head] = {"mean": float(np.mean(values)), "median": float(np.median(values))}
-    write_whole(out / "metrics.csv", "".join(",".join(map(str, line)) + "\n" for line in lines))
-    write_whole(out / "metrics.json", json.dumps(result, indent=1))  # last: a run that has it is finished
-    log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
-    for line in lines:
-        log.info("  ".join(f"{cell:<14.5f}" if isinstance(cell, float) else f"{cell:<14}" for cell in line))
-    log.info("metrics:       %s", out / "metrics.json")
-    return result
+    cd = None if isinstance(row.metrics, DistanceMetrics) else row.metrics.cd
+    return f"{row.role.replace('_', '-')}, {'no surface' if cd is None else f'CD {cd * 1e3:.3f}'}"

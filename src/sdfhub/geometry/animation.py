@@ -10,13 +10,7 @@ from sdfhub.geometry.contact_sheet import write_picture
 
 
 def animation(images: Sequence[np.ndarray], path: Path, seconds: float = 2.0) -> Path:
-    """Writes pictures as a GIF that runs to the last and back again, for ever; whole or not at all.
-
-    Args:
-        images: [S, S, 3] uint8, of one size; at least one.
-        path: where the GIF goes; its folder is made.
-        seconds: from the first to the last.
-    """
+    """Writes pictures [S, S, 3] uint8 as a GIF that takes `seconds` to the last one and back, for ever."""
     palette = Image.fromarray(np.hstack(list(images))).quantize(256)  # one for all, or colours flicker
     frames = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     frames += frames[-2:0:-1]

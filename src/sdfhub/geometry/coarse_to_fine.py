@@ -1,20 +1,19 @@
 """Which parts of a grid the zero level of a field can pass, from few evaluations, for many shapes at once.
 
 A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2, the finest thing that is skipped.
-Cells and blocks are rows [shape, i, j, k]. A cell is sampled at its *centre*, the node s / 2 steps above its
-lowest corner, or the grid's last one. Slopes are per grid step: no length of the frame enters.
+Cells are rows [shape, i, j, k]. A cell is sampled at its *centre*, the node s / 2 steps above its lowest
+corner, or the grid's last one. Slopes are per grid step.
 
 A centre with the value f decides the sign of every node of its cell within |f| / L steps, where L bounds the
 slope of the field in the cell; a cell whose nodes are all decided is skipped. Of the blocks left, only nodes
-that no block decides are evaluated, and those of cells on which the sign changes. Nothing about a network
-guarantees an L: those trained with clamped distances say only "far" beyond the clamp, and may be steeper than
-1 or nearly flat. So L is measured from the samples around the cell, multiplied by a safety factor, and never
-below the slopes near the surface. Missed cells are found by growing: wherever a sign change leaves the
-blocks, the neighbour joins them, and when an inferred sign proves wrong, all are evaluated again. So a
-connected piece of surface is found whole or not at all.
+that no block decides are evaluated, and those of cells on which the sign changes. L is the steepest slope
+between samples around the cell, times a safety factor, and never below the slopes near the surface: networks
+trained with clamped distances may be steeper than 1 or nearly flat. Missed blocks are found by growing:
+wherever a sign change leaves the blocks, the neighbour joins them, and when an inferred sign proves wrong,
+all are evaluated again. So a connected piece of surface is found whole or not at all.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -24,8 +23,7 @@ from sdfhub.geometry.grid import Grid
 _SMALL = 16  # below this many nodes per axis a coarse level says nothing
 _NEAR = 0.05  # share of the coarse samples, those nearest to zero, that set the least slope
 _CHILDREN = np.indices((1, 2, 2, 2)).reshape(4, 8).T
-_SIDES = [(axis, step) for axis in range(3) for step in (-1, 1)]
-_OUTSIDE, _INFERRED, _EVALUATED = 1, 2, 4  # state of a node, as bits; 0: unstates
+_OUTSIDE, _INFERRED, _EVALUATED = 1, 2, 4  # state of a node, as bits; 0: unknown
 
 
 class SampledCells(NamedTuple):
@@ -35,10 +33,12 @@ class SampledCells(NamedTuple):
     values: np.ndarray
     slope: np.ndarray
 
+    def where(self, mask: Any) -> "SampledCells":
+        return SampledCells(*(array[mask] for array in self))
+
     def candidates(self, stride: int) -> "SampledCells":
         """The cells that may hold the surface."""
-        keep = ~self.decides(stride * np.sqrt(3) / 2)
-        return SampledCells(*(array[keep] for array in self))
+        return self.where(~self.decides(stride * np.sqrt(3) / 2))
 
     def decides(self, distance: float) -> np.ndarray:
         """[C] whether nodes of the cell this many steps from its centre surely have the centre's sign."""
@@ -48,18 +48,17 @@ class SampledCells(NamedTuple):
 def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
     """The blocks in cells that coarser levels could not skip, those of a shape together.
 
-    Args:
-        grid: of all shapes.
-        coarse: cells per axis at the coarsest level, about: strides are powers of two.
-        safety: factor on the measured slopes.
+    Strides are powers of two, with about `coarse` cells per axis first; `safety` multiplies measured slopes.
     """
+    stride = 2 if grid.n <= _SMALL else 2 ** max(1, round(np.log2((grid.n - 1) / coarse)))
+    m = _cells_per_axis(grid.n, stride)
+    cells = np.indices((len(grid.shapes), m, m, m), grid.integers).reshape(4, -1).T
+    values = grid.evaluate(_centre_keys(grid, cells, stride))
     if grid.n <= _SMALL:
-        blocks = _cells(grid, 2)
-        return SampledCells(
-            blocks, grid.evaluate(_centre_keys(grid, blocks, 2)), np.full(len(blocks), np.inf)
-        )
-    stride = 2 ** max(1, round(np.log2((grid.n - 1) / coarse)))
-    sampled = _coarse_cells(grid, stride, safety)
+        return SampledCells(cells, values, np.full(len(cells), np.inf))
+    fields = values.reshape(-1, m, m, m)
+    bounds = [_slope_bounds(*pair) for pair in zip(np.abs(fields), _slope(fields, stride), strict=True)]
+    sampled = SampledCells(cells, values, safety * np.stack(bounds).reshape(-1))
     while stride > 2:
         sampled = _refine(grid, sampled.candidates(stride), stride // 2, safety)
         stride //= 2
@@ -67,11 +66,7 @@ def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
 
 
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The cells of stride 1 on which the sign changes, and the values at their nodes.
-
-    Args:
-        grid: of all shapes.
-        sampled: blocks; the candidates among them grow until no sign change leaves them.
+    """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
     Returns:
         keys [M] of the cells' lowest nodes; keys [K] of nodes, those of the cells among them, each once and
@@ -80,7 +75,8 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
     active = np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
-    samples, crossed = [(_centre_keys(grid, sampled.cells, 2), sampled.values)], [np.empty(0, grid.integers)]
+    samples = [(_centre_keys(grid, sampled.cells, 2), sampled.values)]
+    crossed: list[np.ndarray] = [np.empty(0, grid.integers)]
     states[samples[0][0]] = _evaluated_states(sampled.values)
     while len(blocks):
         active[tuple(blocks.T)] = True
@@ -102,14 +98,14 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
 def _inferred_states(grid: Grid, sampled: SampledCells) -> np.ndarray:
     """States of all nodes of the grid, flat, inferred from blocks; those that leave the grid are left out."""
     states = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
-    within = (2 * sampled.cells[:, 1:] + 2 < grid.n).all(axis=1)
-    sampled = SampledCells(*(array[within] for array in sampled))
+    sampled = sampled.where((2 * sampled.cells[:, 1:] + 2 < grid.n).all(axis=1))
     centres = _centre_keys(grid, sampled.cells, 2)
     inferred = np.where(sampled.values > 0, _INFERRED | _OUTSIDE, _INFERRED).astype(np.int8)
+    offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     for squared in (3, 2, 1):
         sure = sampled.decides(np.sqrt(squared))
         near, signs = centres[sure], inferred[sure]
-        for offset in np.argwhere(np.square(np.indices((3, 3, 3)) - 1).sum(axis=0) == squared) - 1:
+        for offset in offsets[np.square(offsets).sum(axis=1) == squared]:
             states[near + _distance(offset, grid.n)] = signs
     return states
 
@@ -123,30 +119,14 @@ def _cells_per_axis(n: int, stride: int) -> int:
     return -(-(n - 1) // stride)
 
 
-def _cells(grid: Grid, stride: int) -> np.ndarray:
-    """All cells [C, 4] of a stride."""
-    sizes = len(grid.shapes), *[_cells_per_axis(grid.n, stride)] * 3
-    return np.indices(sizes, grid.integers).reshape(4, -1).T
-
-
 def _centre_keys(grid: Grid, cells: np.ndarray, stride: int) -> np.ndarray:
     shape, *ijk = cells.T
     i, j, k = (np.minimum(index * stride + stride // 2, grid.n - 1) for index in ijk)
     return ((shape * grid.n + i) * grid.n + j) * grid.n + k
 
 
-def _coarse_cells(grid: Grid, stride: int, safety: float) -> SampledCells:
-    """All cells of the coarsest level."""
-    m = _cells_per_axis(grid.n, stride)
-    cells = _cells(grid, stride)
-    values = grid.evaluate(_centre_keys(grid, cells, stride)).reshape(-1, m, m, m)
-    size, slope = np.abs(values), _slope(values, stride)
-    bound = safety * np.stack([_least_slope(*pair) for pair in zip(size, slope, strict=True)])
-    return SampledCells(cells, values.reshape(-1), bound.reshape(-1))
-
-
-def _least_slope(size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Bounds [m, m, m] on slopes: the steepest around a cell, and no less than near the surface."""
+def _slope_bounds(size: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """[m, m, m] the steepest slope around a cell, and no less than near the surface."""
     near = slope[size <= np.quantile(size, _NEAR)]
     return np.maximum(maximum_filter(slope, 3), np.quantile(near, 0.9))
 
@@ -168,8 +148,7 @@ def _refine(grid: Grid, parents: SampledCells, stride: int, safety: float) -> Sa
     values = grid.evaluate(_centre_keys(grid, children, stride))
     siblings = _slope(values.reshape(-1, 2, 2, 2), stride).reshape(-1, 8).max(axis=1, initial=0)
     slope = np.repeat(np.maximum(parents.slope, safety * siblings), 8)
-    within = (children[:, 1:] * stride < grid.n - 1).all(axis=1)
-    return SampledCells(children[within], values[within], slope[within])
+    return SampledCells(children, values, slope).where((children[:, 1:] * stride < grid.n - 1).all(axis=1))
 
 
 def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
@@ -182,7 +161,8 @@ def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
 
 def _evaluate(grid: Grid, keys: np.ndarray, states: np.ndarray, samples: list) -> bool:
     """Evaluates the nodes that are not yet; returns whether an inferred sign proves wrong."""
-    keys = _distinct(keys[states[keys] < _EVALUATED])
+    keys = np.sort(keys[states[keys] < _EVALUATED])
+    keys = keys[np.diff(keys, prepend=-1) > 0]  # np.unique is 30 times slower on keys that repeat little
     values = grid.evaluate(keys)
     before, after = states[keys], _evaluated_states(values)
     states[keys] = after
@@ -191,7 +171,6 @@ def _evaluate(grid: Grid, keys: np.ndarray, states: np.ndarray, samples: list) -
 
 
 def _evaluated_states(values: np.ndarray) -> np.ndarray:
-    """States of nodes with these values."""
     return np.where(values > 0, _EVALUATED | _OUTSIDE, _EVALUATED).astype(np.int8)
 
 
@@ -199,29 +178,22 @@ def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarra
     """[C, 2, 2, 2] whether the sign changes on the cells of blocks with nodes `outside` [C, 3, 3, 3]."""
     any_outside = all_outside = outside  # of the corners of a cell
     for axis in (1, 2, 3):
-        low, high = [slice(None)] * axis + [slice(2)], [slice(None)] * axis + [slice(1, 3)]
-        any_outside = any_outside[tuple(low)] | any_outside[tuple(high)]
-        all_outside = all_outside[tuple(low)] & all_outside[tuple(high)]
+        low, high = (tuple([slice(None)] * axis + [slice(first, first + 2)]) for first in (0, 1))
+        any_outside = any_outside[low] | any_outside[high]
+        all_outside = all_outside[low] & all_outside[high]
     crossed = any_outside != all_outside
     for axis in (1, 2, 3):
         np.moveaxis(crossed, axis, 1)[:, 1] &= (2 * blocks[:, axis] + 1 < n - 1)[:, None, None]
     return crossed
 
 
-def _distinct(keys: np.ndarray) -> np.ndarray:
-    """Every key once, ascending: as `np.unique`, 30 times faster on keys that repeat little."""
-    keys = np.sort(keys)
-    return keys[np.diff(keys, prepend=-1) > 0]
-
-
 def _crossed_neighbours(active: np.ndarray, blocks: np.ndarray, outside: np.ndarray) -> np.ndarray:
     """Inactive blocks [C, 4] behind those faces of `blocks` on which the sign changes."""
     crossed = [blocks[:0]]
-    for axis, step in _SIDES:
-        face = outside.take(1 + step, axis=axis + 1).reshape(-1, 9)
+    for axis, step in [(axis, step) for axis in (1, 2, 3) for step in (-1, 1)]:
+        face = outside.take(1 + step, axis=axis).reshape(-1, 9)
         neighbours = blocks[face.any(axis=1) & ~face.all(axis=1)]
-        neighbours[:, axis + 1] += step
-        within = (neighbours[:, axis + 1] >= 0) & (neighbours[:, axis + 1] < active.shape[-1])
-        crossed.append(neighbours[within])
+        neighbours[:, axis] += step
+        crossed.append(neighbours[(neighbours[:, axis] >= 0) & (neighbours[:, axis] < active.shape[-1])])
     behind = np.concatenate(crossed)
     return np.unique(behind[~active[tuple(behind.T)]], axis=0)

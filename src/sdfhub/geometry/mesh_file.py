@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -9,23 +10,16 @@ from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.shapes import Mesh
 from sdfhub.whole_file import write_whole
 
-FORMATS = ("ply", "obj", "glb")
-"""Formats of written meshes."""
-
+FORMATS = ("ply", "obj", "glb")  # formats of written meshes
 FAR = 16
-"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it: scans
-in geographic coordinates lie far beyond. GLB has no other coordinates; OBJ is text."""
+"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as in
+geographic coordinates. GLB has no other coordinates; OBJ is text."""
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Writes a mesh in the format of the path's suffix, whole or not at all.
+    """Writes a mesh [V, 3], [F, 3] in the format of the path's suffix, one of FORMATS, whole or not at all.
 
     Without faces nothing is written, and an earlier mesh there is removed.
-
-    Args:
-        vertices: [V, 3], in any frame.
-        faces: [F, 3].
-        path: ends in one of FORMATS.
     """
     if not len(faces):
         path.unlink(missing_ok=True)
@@ -45,19 +39,12 @@ def _ply(vertices: np.ndarray, faces: np.ndarray) -> bytes:
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
     rows["count"], rows["corners"] = 3, faces
-    return (
-        "\n".join(head).encode() + np.asarray(vertices, "<f8" if is_far else "<f4").tobytes() + rows.tobytes()
-    )
+    coordinates = np.asarray(vertices, "<f8" if is_far else "<f4")
+    return "\n".join(head).encode() + coordinates.tobytes() + rows.tobytes()
 
 
 def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
-    """Writes meshes side by side as one scene, upright for viewers (+y up); empty ones are left out.
-
-    Args:
-        meshes: in the normalised frame.
-        up: their axis that points up.
-        path: of a .glb file.
-    """
+    """Writes meshes, normalised frame, side by side as a .glb, upright for viewers; leaves out empty ones."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -69,6 +56,5 @@ def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
         _export(scene, path)
 
 
-def _export(content, path: Path) -> None:
-    exported = content.export(file_type=path.suffix[1:])
-    write_whole(path, exported.encode() if isinstance(exported, str) else exported)
+def _export(content: Any, path: Path) -> None:
+    write_whole(path, content.export(file_type=path.suffix[1:]))

@@ -1,6 +1,6 @@
 """From fields to meshes: marching cubes at the zero level, dense or coarse to fine, one shape or many.
 
-Grid: `resolution` nodes along each axis of the cube [-bound, bound]^3, both end points included.
+Grid: `resolution` nodes along each axis of the cube [-1, 1]^3, both end points included.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,11 +24,10 @@ def mesh_fields(
     fields: Fields,
     shapes: int,
     resolution: int = 256,
-    bound: float = 1.0,
     coarse: int = 32,
     batch: int | None = None,
     safety: float = 1.25,
-    device: torch.device | str | None = None,
+    device: torch.device | str = "cpu",
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
 
@@ -40,11 +39,10 @@ def mesh_fields(
             repeated in any way) to signed distances [B, N], negative inside.
         shapes: how many.
         resolution: grid nodes per axis, >= 2.
-        bound: half the edge of the cube, normalised frame.
         coarse: cells per axis at the coarsest level, about: strides are powers of two.
         batch: points per call of `fields`; None chooses by device.
         safety: factor on the measured slopes; larger misses less and evaluates more.
-        device: where `fields` expects its points; by default that of its parameters, else the CPU.
+        device: where `fields` expects its points.
 
     Yields:
         a mesh per shape, in order; empty where the field has no zero crossing.
@@ -52,47 +50,33 @@ def mesh_fields(
     Raises:
         SdfhubError: a field returned values that are not finite.
     """
-    together = max(1, _NODES_TOGETHER // max(resolution, 1) ** 3)
+    nodes = resolution**3
+    together = max(1, _NODES_TOGETHER // nodes)
     for first in range(0, shapes, together):
         group = range(first, min(first + together, shapes))
-        grid = _grid(fields, group, resolution, bound, batch, device)
+        grid = _grid(fields, group, resolution, batch, device)
         cells, keys, values = evaluate_crossed_cells(grid, sample_blocks(grid, coarse, safety))
-        of_cell, of_key = cells // resolution**3, keys // resolution**3
+        of_cell, of_key = cells // nodes, keys // nodes
         for shape in range(len(group)):
-            own, held, offset = cells[of_cell == shape], of_key == shape, shape * resolution**3
+            own, held, offset = cells[of_cell == shape], of_key == shape, shape * nodes
             yield grid.to_frame(*march_cells(own - offset, keys[held] - offset, values[held], resolution))
 
 
 def mesh_field(
     field: Field,
     resolution: int = 256,
-    bound: float = 1.0,
     coarse: int = 32,
     batch: int | None = None,
     safety: float = 1.25,
-    device: torch.device | str | None = None,
+    device: torch.device | str = "cpu",
 ) -> Mesh:
-    """The zero level of one field, evaluated coarse to fine: `mesh_fields` of one shape.
-
-    Args, Raises: as there, with a field that takes points [N, 3] alone.
-    """
-    device = device or _device_of(field)
-    return next(mesh_fields(_as_fields(field), 1, resolution, bound, coarse, batch, safety, device))
+    """The zero level of one field, which takes points [N, 3] alone: `mesh_fields` of one shape."""
+    return next(mesh_fields(_as_fields(field), 1, resolution, coarse, batch, safety, device))
 
 
-def mesh_dense(
-    field: Field,
-    resolution: int = 256,
-    bound: float = 1.0,
-    batch: int | None = None,
-    device: torch.device | str | None = None,
-) -> Mesh:
-    """The zero level of one field, every node of the grid evaluated: the plain twin.
-
-    Args, Raises: as for `mesh_field`.
-    """
-    grid = _grid(_as_fields(field), range(1), resolution, bound, batch, device or _device_of(field))
-    nodes = resolution**3
+def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str = "cpu") -> Mesh:
+    """The zero level of one field, every node of the grid evaluated: the plain twin of `mesh_field`."""
+    grid, nodes = _grid(_as_fields(field), range(1), resolution, None, device), resolution**3
     keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
     values = np.concatenate([grid.evaluate(part) for part in keys])
     return grid.to_frame(*march(values.reshape((resolution,) * 3)))
@@ -103,9 +87,7 @@ def sdf_slice(
     axis: int = 1,
     offset: float = 0.0,
     resolution: int = 256,
-    bound: float = 1.0,
-    batch: int | None = None,
-    device: torch.device | str | None = None,
+    device: torch.device | str = "cpu",
 ) -> np.ndarray:
     """The field on a plane across one axis.
 
@@ -114,41 +96,27 @@ def sdf_slice(
         axis: 0, 1 or 2, the axis that the plane is perpendicular to.
         offset: the plane's coordinate on that axis, normalised frame.
         resolution: R, nodes per side; the outermost lie on the cube's faces.
-        bound, batch, device: as for `mesh_field`.
+        device: where `field` expects its points.
 
     Returns:
         [R, R] float32, one index for each of the two axes left, in their order, both ascending.
     """
-    grid = _grid(_as_fields(field), range(1), resolution, bound, batch, device or _device_of(field))
+    grid = _grid(_as_fields(field), range(1), resolution, None, device)
     plane = torch.cartesian_prod(grid.axis, grid.axis)
     at = torch.full_like(plane[:, :1], offset)
     points = torch.cat([plane[:, :axis], at, plane[:, axis:]], dim=1)
-    return grid.evaluate_points(points).reshape(resolution, resolution)
+    parts = [grid.values_at(part[None], np.zeros(1, np.int64))[0] for part in points.split(grid.batch)]
+    return np.concatenate(parts).reshape(resolution, resolution)
 
 
 def _grid(
-    fields: Fields,
-    shapes: range,
-    resolution: int,
-    bound: float,
-    batch: int | None,
-    device: torch.device | str | None,
+    fields: Fields, shapes: range, resolution: int, batch: int | None, device: torch.device | str
 ) -> Grid:
-    device = torch.device(device or _device_of(fields) or "cpu")
+    device = torch.device(device)
     batch = batch or (_CACHED * torch.get_num_threads() if device.type == "cpu" else _LARGE)
-    return Grid(fields, shapes, resolution, bound, batch, device)
+    return Grid(fields, shapes, resolution, batch, device)
 
 
 def _as_fields(field: Field) -> Fields:
     """A field of one shape as fields of a single one."""
-
-    def fields(points: torch.Tensor, shapes: torch.Tensor) -> torch.Tensor:
-        values = field(points.flatten(0, 1))
-        return values.unflatten(0, points.shape[:2]) if values.shape == (points[..., 0].numel(),) else values
-
-    return fields
-
-
-def _device_of(field: Field | Fields) -> torch.device | None:
-    parameters = field.parameters() if isinstance(field, torch.nn.Module) else ()
-    return next((parameter.device for parameter in parameters), None)
+    return lambda points, shapes: field(points.flatten(0, 1)).unflatten(0, points.shape[:2])

@@ -3,11 +3,14 @@
 All meshes are (vertices [V, 3], faces [F, 3]) in one frame, the normalised one unless a name says `source`.
 Lengths are in that frame's units, Chamfer distances in their squares; nothing is multiplied by 10^3 here.
 
-A Chamfer distance between finite samples is never zero: two samplings of one surface differ by the *noise
-floor*, which grows with area and falls with the number of points. `excess` is the rest of a distance.
+Two samplings of one surface differ by the *noise floor*, which grows with area and falls with the number of
+points. `excess` is the rest of a Chamfer distance.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
 
 import igl
 import numpy as np
@@ -18,14 +21,17 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-IOU_POINTS = 20_000
-"""Uniform points for the volumetric IoU."""
+Sampled = tuple[np.ndarray, np.ndarray]
+"""Points [N, 3] of a surface and the normals there [N, 3]."""
 
 FAILURES = (
     "failed: shapes without a reconstructed surface. They enter no statistic but cd_mean_with_failures and "
     "cd_median_with_failures, where each counts as if its reconstruction were one point at the origin."
 )
 """How `summarize` treats failures, in words for a report."""
+
+STATISTICS: dict[str, Callable[..., Any]]
+STATISTICS = {"mean": np.mean, "median": np.median, "p90": partial(np.percentile, q=90)}
 
 
 @dataclass(frozen=True)
@@ -38,18 +44,15 @@ class ShapeMetrics:
         excess: cd - floor; below 0 by chance where a reconstruction is as good as the truth.
         cd_source: `cd` in squared units of the source's own frame.
         point_to_surface: mean of `accuracy` and `completeness`.
-        accuracy: mean distance from the reconstruction's samples to the true surface.
-        accuracy_p95: 95th percentile of the same.
-        completeness: mean distance from the truth's samples to the reconstructed surface.
-        completeness_p95: 95th percentile of the same.
+        accuracy, accuracy_p95: mean and 95th percentile of the distance from the reconstruction's samples to
+            the true surface.
+        completeness, completeness_p95: the same from the truth's samples to the reconstructed surface.
         normal_consistency: mean |n . n'| over nearest samples, both directions averaged, in [0, 1].
         f_score: harmonic mean of the shares of either side's samples within tau of the other surface.
         iou: volume of the intersection over that of the union; None unless both meshes are closed.
         cd_penalty: `cd` of a single point at the origin, which stands for a failed reconstruction.
         failed: the reconstruction has no surface. Everything but `floor` and `cd_penalty` is None then.
-        vertices: count in the reconstruction.
-        faces: count in the reconstruction.
-        pieces: connected pieces of the reconstruction: parts of the shape, and crumbs that float beside it.
+        vertices, faces, pieces: counts in the reconstruction; pieces are connected, crumbs among them.
     """
 
     cd: float | None
@@ -86,39 +89,33 @@ def judge(
     mesh = Mesh(*map(np.ascontiguousarray, reconstruction, (np.float64, np.int64)))
     true_mesh = Mesh(truth.vertices, truth.faces)
     expected = sample_surface(*true_mesh, points, (seed, 0))
-    resampled, _ = sample_surface(*true_mesh, points, (seed, 1))
-    values = dict.fromkeys(field.name for field in fields(ShapeMetrics)) | {
-        "floor": chamfer(expected[0], resampled),
+    values: dict[str, Any] = dict.fromkeys(field.name for field in fields(ShapeMetrics))
+    values |= {
+        "floor": chamfer(expected[0], sample_surface(*true_mesh, points, (seed, 1))[0]),
         "cd_penalty": chamfer(np.zeros((1, 3)), expected[0]),
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "pieces": piece_count(mesh.faces, len(mesh.vertices)),
         "failed": not np.abs(face_normals(*mesh)).sum() > 0,
     }
-    if values["failed"]:
-        return ShapeMetrics(**values)
-    samples = sample_surface(*mesh, points, (seed, 2))
-    values |= _sampled_metrics(samples, expected)
-    values |= _surface_metrics(samples[0], mesh, expected[0], true_mesh, tau)
-    values["excess"] = values["cd"] - values["floor"]
-    values["cd_source"] = values["cd"] / float(truth.scale) ** 2
-    values["iou"] = volumetric_iou(mesh, true_mesh, seed=seed)
+    if not values["failed"]:
+        samples = sample_surface(*mesh, points, (seed, 2))
+        values |= _sampled_metrics(samples, expected)
+        values |= _surface_metrics(samples[0], mesh, expected[0], true_mesh, tau)
+        values["excess"] = values["cd"] - values["floor"]
+        values["cd_source"] = values["cd"] / float(truth.scale) ** 2
+        values["iou"] = volumetric_iou(mesh, true_mesh, seed=seed)
     return ShapeMetrics(**values)
 
 
 @dataclass(frozen=True)
 class Judge:
-    """`judge` with fixed settings, which pickles for worker processes.
-
-    Args:
-        points, seed: as in `judge`.
-    """
+    """`judge` of a pair, with fixed `points` and `seed`; pickles for worker processes."""
 
     points: int
     seed: int
 
     def __call__(self, pair: tuple[Mesh, NormalizedMesh]) -> ShapeMetrics:
-        """The judgement of a reconstruction against the true mesh."""
         return judge(*pair, points=self.points, seed=self.seed)
 
 
@@ -128,24 +125,17 @@ def chamfer(a: np.ndarray, b: np.ndarray) -> float:
     Source: Fan et al., A Point Set Generation Network, 2017, with means for sums.
 
     Args:
-        a: [N, 3], N > 0.
-        b: [M, 3], M > 0, in the same frame.
+        a, b: [N, 3] and [M, 3], N and M > 0, in the same frame.
     """
     return float(np.mean(_nearest(a, b)[0] ** 2) + np.mean(_nearest(b, a)[0] ** 2))
 
 
-def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> float | None:
-    """Volume inside both meshes over volume inside either, from uniform points in their joint bounding box.
+def volumetric_iou(a: Mesh, b: Mesh, count: int = 20_000, seed: int = 0) -> float | None:
+    """Volume inside both meshes over volume inside either, from `count` points in their joint bounding box.
 
-    A point is inside where the winding number is positive, that is above 1/2, since it is whole.
+    A point is inside where the winding number is positive. None where a mesh is open, or both are empty.
 
-    Args:
-        a, b: vertices and faces in one frame.
-        count: points; the standard error is about sqrt(iou (1 - iou) / points in the union).
-        seed: of the points.
-
-    Returns:
-        In [0, 1], or None where a mesh is open, or both are empty.
+    Source: Barill et al., Fast Winding Numbers for Soups and Clouds, 2018.
     """
     if not (is_closed(*a) and is_closed(*b)):
         return None
@@ -153,16 +143,13 @@ def volumetric_iou(a: Mesh, b: Mesh, count: int = IOU_POINTS, seed: int = 0) -> 
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = np.random.default_rng(seed).uniform(low, high, (count, 3))
     points = points[morton_order(points)]
-    inside = [_winding_numbers(mesh, points) > 0.5 for mesh in (a, b)]
+    inside = []
+    for mesh in (a, b):
+        tree = igl.FastWindingNumberBVH()
+        tree.init(*mesh, 2)
+        inside.append(tree.winding_number(points, 2.0) > 0.5)  # to 0.01
     union = np.count_nonzero(inside[0] | inside[1])
     return float(np.count_nonzero(inside[0] & inside[1]) / union) if union else None
-
-
-def _winding_numbers(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """[N] to 0.01. Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds."""
-    tree = igl.FastWindingNumberBVH()
-    tree.init(*mesh, 2)
-    return tree.winding_number(points, 2.0)
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
@@ -170,10 +157,8 @@ def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
     Vertices at the same place count as one.
     """
-    if not len(faces):
-        return False
-    if _edges_cancel(faces):
-        return True
+    if not len(faces) or _edges_cancel(faces):
+        return bool(len(faces))
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     return _edges_cancel(place.reshape(-1)[faces])
 
@@ -186,38 +171,32 @@ def _edges_cancel(faces: np.ndarray) -> bool:
     return np.array_equal(rising, falling)
 
 
-def summarize(rows: list[ShapeMetrics]) -> dict:
+def summarize(rows: Sequence[ShapeMetrics]) -> dict[str, Any]:
     """Mean, median and 90th percentile of every metric over a set of shapes, failures counted beside them.
 
     Returns:
         `shapes`, `failed`, `failures` (how failures enter, in words), `cd_mean_with_failures` and
-        `cd_median_with_failures`, and per metric a dict of `mean`, `median`, `p90` and `count`, the number of
-        shapes that have it; the three are None where none has.
+        `cd_median_with_failures`, and per metric `mean`, `median` and `p90`, None where no shape has it, and
+        `count`, the number of shapes that have it.
     """
-    with_failures = [row.cd_penalty if row.failed else row.cd for row in rows]
-    summary = {
-        "shapes": len(rows),
-        "failed": sum(row.failed for row in rows),
-        "failures": FAILURES,
-        "cd_mean_with_failures": float(np.mean(with_failures)) if rows else None,
-        "cd_median_with_failures": float(np.median(with_failures)) if rows else None,
-    }
-    for name in (f.name for f in fields(ShapeMetrics) if f.name not in ("failed", "cd_penalty")):
+    with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
+    summary: dict[str, Any] = {"shapes": len(rows), "failed": sum(row.failed for row in rows)}
+    summary["failures"] = FAILURES
+    for name in ("mean", "median"):
+        summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
+    for name in (field.name for field in fields(ShapeMetrics) if field.name not in ("failed", "cd_penalty")):
         values = [getattr(row, name) for row in rows if not row.failed and getattr(row, name) is not None]
-        statistics = {"mean": np.mean, "median": np.median, "p90": lambda array: np.percentile(array, 90)}
-        summary[name] = {key: float(of(values)) if values else None for key, of in statistics.items()}
+        summary[name] = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
         summary[name]["count"] = len(values)
     return summary
 
 
-def _sampled_metrics(samples: tuple, expected: tuple) -> dict[str, float]:
-    """Chamfer distance and normal consistency of two pairs of points and normals."""
+def _sampled_metrics(samples: Sampled, expected: Sampled) -> dict[str, float]:
+    """Chamfer distance and normal consistency."""
     to_expected, partner = _nearest(samples[0], expected[0])
     to_samples, origin = _nearest(expected[0], samples[0])
-    cosines = [
-        np.abs(np.einsum("ij,ij->i", samples[1], expected[1][partner])).mean(),
-        np.abs(np.einsum("ij,ij->i", expected[1], samples[1][origin])).mean(),
-    ]
+    pairs = (samples[1], expected[1][partner]), (expected[1], samples[1][origin])
+    cosines = [np.abs(np.einsum("ij,ij->i", *pair)).mean() for pair in pairs]
     cd = np.mean(to_expected**2) + np.mean(to_samples**2)
     return {"cd": float(cd), "normal_consistency": float(np.mean(cosines))}
 
@@ -227,7 +206,7 @@ def _surface_metrics(
 ) -> dict[str, float]:
     """Metrics from exact distances of samples to the other surface: they have no noise floor."""
     to_truth, to_mesh = point_to_surface(samples, *truth), point_to_surface(expected, *mesh)
-    precision, recall = np.mean(to_truth < tau), np.mean(to_mesh < tau)
+    precision, recall = float(np.mean(to_truth < tau)), float(np.mean(to_mesh < tau))
     values = {
         "point_to_surface": (to_truth.mean() + to_mesh.mean()) / 2,
         "accuracy": to_truth.mean(),

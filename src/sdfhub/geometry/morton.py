@@ -21,7 +21,7 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """[N] permutation that sorts points [N, 3] along the Z curve, so that neighbours follow each other."""
+    """[N] permutation that sorts points [N, 3] along the Z curve."""
     keys = morton_codes(points) << 32 | np.arange(len(points))  # one number: faster than a stable argsort
     keys.sort()
     return keys & 0xFFFFFFFF

@@ -1,7 +1,6 @@
 """Meshes to pictures by ray casting, without a display.
 
-Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +y up are turned first. Colours
-are linear RGB in [0, 1] until the last step, which maps them to sRGB bytes.
+Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +y up are turned first.
 """
 
 import igl
@@ -13,9 +12,7 @@ from sdfhub.geometry.sphere import sphere_directions
 from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.triangles import face_normals
 
-CLAY = (0.30, 0.46, 0.72)
-"""Default surface colour, linear RGB."""
-
+_CLAY = np.array([0.30, 0.46, 0.72])  # surface colour, linear RGB
 _CREASE = 38.0  # degrees; edges sharper than this stay sharp
 _SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
 _KEY = np.array([-0.45, -0.6, 0.95])
@@ -30,13 +27,10 @@ def render(
     up: UpAxis = "z",
     azimuth: float = -55.0,
     elevation: float = 24.0,
-    colour: tuple[float, float, float] = CLAY,
     background: float = 1.0,
     occlusion_rays: int = 8,
 ) -> np.ndarray:
-    """A shaded picture of a mesh from a three-quarter view.
-
-    Both sides of a face are lit, so that holes and flipped faces stay visible as shape, not as black.
+    """A shaded picture of a mesh from a three-quarter view; both sides of its faces are lit.
 
     Args:
         vertices: [V, 3], within the unit ball.
@@ -45,7 +39,6 @@ def render(
         up: the axis of the mesh that points up; with "y" its front looks along +z, as is usual there.
         azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
         elevation: height of the camera above the horizon in degrees.
-        colour: linear RGB of the surface, each in [0, 1].
         background: sRGB grey level around the shape, in [0, 1].
         occlusion_rays: rays to the sky per sample (four samples a pixel); 0 leaves the sky unoccluded.
 
@@ -65,8 +58,7 @@ def render(
         normals, flat = _normals(vertices, faces, hits, seen, directions[seen])
         row, column = np.divmod(seen, 2 * size)
         subpixel = 2 * (row % 2) + column % 2  # which of its pixel's four samples a ray is
-        light = _light(scene, points, normals, flat, subpixel, occlusion_rays)
-        image[seen] = np.asarray(colour) * light
+        image[seen] = _CLAY * _light(scene, points, normals, flat, subpixel, occlusion_rays)
     image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
 
@@ -103,12 +95,11 @@ def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndar
     a, e = np.radians([azimuth, elevation])
     back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
-    up = np.cross(back, right)
     distance = 5.0
     half = 1.0 / np.sqrt(distance**2 - 1)  # tangent of the ball's half angle
     steps = (np.arange(pixels) + 0.5) / pixels * 2 - 1
     x, y = np.meshgrid(steps * half, -steps * half)
-    directions = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up - back
+    directions = x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(back, right) - back
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origins = np.broadcast_to(distance * back, directions.shape)
     return origins.astype(np.float32), directions.astype(np.float32)
@@ -122,20 +113,18 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
         corners = igl.per_corner_normals(vertices, faces.astype(np.int64), _CREASE).reshape(-1, 3, 3)[face]
         u, v = hits["u"][seen, None], hits["v"][seen, None]
         smooth = _unit((1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2])
-    away = np.einsum("ij,ij->i", flat, directions) > 0
-    sign = np.where(away, -1.0, 1.0)[:, None]
+    sign = np.where(np.einsum("ij,ij->i", flat, directions) > 0, -1.0, 1.0)[:, None]
     return smooth * sign, flat * sign
 
 
-def _light(scene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
+def _light(scene: EmbreeScene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
     """[N, 3] light at the points: a soft key and a sky dome, both with shadows, and a fill.
 
-    The four samples of a pixel are lit by four interleaved sets of lights: their mean has soft shadows
-    without noise.
+    The four samples of a pixel are lit by four interleaved sets of lights: their mean is smooth.
     """
     start = (points + 2e-3 * flat).astype(np.float32)
     around = _unit(_unit(_KEY) + 0.09 * sphere_directions(12))  # the key is an area light
-    key = sum(_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)) / 3
+    key = np.sum([_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)], axis=0) / 3
     fill = np.clip(normals @ _unit(_FILL), 0, None)
     sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
     warm, cool = np.array([1.0, 0.95, 0.87]), np.array([0.88, 0.95, 1.0])

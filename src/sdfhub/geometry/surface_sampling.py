@@ -8,16 +8,13 @@ from sdfhub.triangles import face_normals
 def sample_surface(
     vertices: np.ndarray, faces: np.ndarray, count: int, seed: int | tuple[int, ...] | np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Independent points on a mesh, uniform by area, those of a face together.
+    """Independent points [count, 3] on a mesh, and the unit normals [count, 3] of their faces, both float64.
 
     Args:
         vertices: [V, 3], any frame.
         faces: [F, 3] rows of `vertices`.
-        count: n, the number of points.
+        count: points; those of a face come together.
         seed: of the generator, or the generator itself.
-
-    Returns:
-        points [n, 3] float64, and the unit normals [n, 3] float64 of their faces, outward as the faces are.
 
     Raises:
         ValueError: the mesh has no area.

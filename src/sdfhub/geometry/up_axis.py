@@ -8,10 +8,7 @@ UpAxis = Literal["y", "z"]
 
 
 def turned_up(points: np.ndarray, up: UpAxis, wanted: UpAxis) -> np.ndarray:
-    """Points [N, 3] of a world with `up` up, turned into one with `wanted` up.
-
-    The front looks towards +z where y is up, and towards -y where z is up.
-    """
+    """Points [N, 3] of a world with `up` up in one with `wanted` up; the front looks to +z or -y then."""
     if up == wanted:
         return points
     x, y, z = np.asarray(points).T

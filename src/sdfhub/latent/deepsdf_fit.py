@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
@@ -16,8 +18,7 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 from sdfhub.shapes import Observation
 
-KNOWN = 5e-3
-"""Bounds no further apart than this, normalised frame, make a signed sample: their middle."""
+KNOWN = 5e-3  # bounds no further apart than this, normalised frame, make a signed sample: their middle
 
 
 @dataclass(frozen=True)
@@ -28,28 +29,24 @@ class DeepSdfFit:
     N(0, 0.01^2), prior 1e-4 * mean z^2, 8000 samples a step.
 
     Args:
-        steps: Adam steps, >= 1.
-        lr: initial learning rate, > 0.
+        steps: Adam steps.
+        lr: initial learning rate.
         drop_at: share of the steps after which the learning rate is divided by 10.
-        per_step: samples a step and shape, >= 2.
-        spread: standard deviation of the initial codes, >= 0.
-        lambda_code: weight of the prior, >= 0.
+        per_step: samples a step and shape.
+        spread: standard deviation of the initial codes.
+        lambda_code: weight of the prior.
         samples: signed samples that an observation of a stored shape should hold; None for all.
         seed: of the initial code and the draws.
     """
 
-    steps: int = 800
-    lr: float = 5e-3
+    steps: PositiveInt = 800
+    lr: PositiveFloat = 5e-3
     drop_at: float = 0.5
-    per_step: int = 8000
-    spread: float = 0.01
-    lambda_code: float = 1e-4
-    samples: int | None = None
+    per_step: Annotated[int, Field(ge=2)] = 8000
+    spread: NonNegativeFloat = 0.01
+    lambda_code: NonNegativeFloat = 1e-4
+    samples: PositiveInt | None = None
     seed: int = 0
-
-    def __post_init__(self):
-        if self.steps < 1 or self.per_step < 2 or self.lr <= 0:
-            raise ValueError("steps must be at least 1, per_step at least 2, lr positive")
 
     @torch.enable_grad()
     def __call__(
@@ -63,11 +60,11 @@ class DeepSdfFit:
         """As `Fit` says.
 
         Raises:
-            SdfhubError: the frame is unknown, or too few bounds are tight enough to be samples.
+            SdfhubError: the frame is unknown, or a side has no bounds tight enough to be samples.
         """
         if poses:
             raise SdfhubError("fit=deepsdf: finds no poses; use fit=gauss_newton")
-        sides = [signed_sides(observation) for observation in observations]
+        sides = [_signed_sides(observation) for observation in observations]
         generator = torch.Generator().manual_seed(self.seed)
         start = self.spread * torch.randn(codes.shape[1], generator=generator)
         with frozen(decoder):
@@ -80,7 +77,7 @@ class DeepSdfFit:
                 loss = clamped_l1(decoder(drawn[..., :3], fitted), drawn[..., 3], delta)
                 loss = loss + self.lambda_code * fitted.square().mean()
                 optimizer.zero_grad()
-                (loss * len(sides)).backward()  # means over shapes would shrink each one's gradient
+                (loss * len(sides)).backward()  # the mean over shapes would shrink their gradients
                 optimizer.step()
             fitted = fitted.detach()
             with torch.no_grad():
@@ -92,19 +89,13 @@ class DeepSdfFit:
     def _drawn(self, sides: tuple[Tensor, Tensor], step: int) -> Tensor:
         """A step's samples [per_step, 4] of a shape."""
         rng = np.random.default_rng((self.seed, step))
-        half = self.per_step // 2
-        counts = self.per_step - half, half
-        return torch.cat(
-            [side[rng.integers(len(side), size=count)] for side, count in zip(sides, counts, strict=True)]
-        )
+        counts = self.per_step - self.per_step // 2, self.per_step // 2
+        pairs = zip(sides, counts, strict=True)
+        return torch.cat([side[rng.integers(len(side), size=count)] for side, count in pairs])
 
 
-def signed_sides(observation: Observation) -> tuple[Tensor, Tensor]:
-    """Samples [N, 4] outside and inside of an observation, points and distances.
-
-    Raises:
-        SdfhubError: one side has none.
-    """
+def _signed_sides(observation: Observation) -> tuple[Tensor, Tensor]:
+    """Samples [N, 4] outside and inside of an observation, points and distances."""
     known = (observation.high - observation.low <= KNOWN) & ~observation.unsigned
     sdf = (observation.low[known] + observation.high[known]) / 2
     rows = torch.from_numpy(np.column_stack([observation.points[known], sdf]))

@@ -8,24 +8,14 @@ from torch import Tensor
 
 
 class Quadratic(NamedTuple):
-    """The objectives of B problems about their unknowns.
-
-    Args:
-        value: [B].
-        gradient: [B, U].
-        hessian: [B, U, U], positive definite.
-    """
+    """B objectives about their unknowns: value [B], gradient [B, U], positive definite hessian [B, U, U]."""
 
     value: Tensor
     gradient: Tensor
     hessian: Tensor
 
 
-ROWS_AT_ONCE = 2**12
-"""Rows differentiated at a time on a CPU, by each thread; bounds memory."""
-
-Objective = Callable[[Tensor, Tensor], Quadratic]
-"""Rows [b] of problems and their unknowns [b, U] -> the objectives there."""
+ROWS_AT_ONCE = 2**12  # rows differentiated at a time on a CPU, by each thread; bounds memory
 
 
 def values_and_jacobian(
@@ -41,17 +31,21 @@ def values_and_jacobian(
         inputs: [R, ...] each.
     """
     size, pairs = ROWS_AT_ONCE if unknowns.is_cpu else max(1, len(unknowns)), []
-    for some, *parts in zip(unknowns.split(size), *(part.split(size) for part in inputs), strict=True):
+    for part, *arguments in zip(unknowns.split(size), *(array.split(size) for array in inputs), strict=True):
         with torch.enable_grad():
-            some = some.detach().requires_grad_()
-            values = function(some, *parts)
-            pairs.append((values.detach(), *torch.autograd.grad(values.sum(), some)))
+            part = part.detach().requires_grad_()
+            values = function(part, *arguments)
+            pairs.append((values.detach(), *torch.autograd.grad(values.sum(), part)))
     values, jacobian = (torch.cat(column) for column in zip(*pairs, strict=True))
     return values, jacobian
 
 
 def descend(
-    objective: Objective, unknowns: Tensor, damping: Tensor, steps: int, tolerance: float
+    objective: Callable[[Tensor, Tensor], Quadratic],
+    unknowns: Tensor,
+    damping: Tensor,
+    steps: int,
+    tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Unknowns [B, U] after at most `steps` steps, the damping [B] to go on with, the objectives [B] there.
 
@@ -60,7 +54,7 @@ def descend(
     Source: Levenberg 1944 and Marquardt 1963.
 
     Args:
-        objective: of the B problems.
+        objective: of rows [b] of the B problems at their unknowns [b, U].
         unknowns: [B, U] where to start.
         damping: [B], in units of the Hessians' mean diagonals.
         steps: >= 1.
@@ -70,14 +64,14 @@ def descend(
     left = torch.arange(len(unknowns), device=unknowns.device)  # problems that are not done
     here = objective(left, unknowns)
     for _ in range(steps):
-        tried = unknowns[left] + _step(here.gradient[left], here.hessian[left], damping[left])
-        there = objective(left, tried)
+        trial = unknowns[left] + _step(here.gradient[left], here.hessian[left], damping[left])
+        there = objective(left, trial)
         gain = here.value[left] - there.value
         lower = gain > 0  # false where there is no number
         damping[left] = torch.where(lower, damping[left] * 0.3, damping[left] * 4).clamp(1e-5, 1e6)
         done = lower & (gain < tolerance * here.value[left])
         better = left[lower]
-        unknowns[better] = tried[lower]
+        unknowns[better] = trial[lower]
         for old, new in zip(here, there, strict=True):
             old[better] = new[lower]
         left = left[~done]

@@ -1,6 +1,6 @@
 """What every fit of codes shares: observations go in, codes come out, the decoder stays as it is."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
@@ -66,30 +66,24 @@ def fit_groups(
 
     On a CPU each has a thread of its own, so that no neighbour changes even a rounding.
     """
-    if is_cpu(device):
-        return joined(side_by_side(lambda observation: fit([observation]), observations, least=1))
-    rows: dict[tuple[int, bool], list[int]] = {}
+    groups: dict[Hashable, list[int]] = {}
     for row, observation in enumerate(observations):
-        rows.setdefault((len(observation.points), observation.is_exact), []).append(row)
-    codes, residuals, poses = joined([fit([observations[row] for row in group]) for group in rows.values()])
-    order = torch.tensor([row for group in rows.values() for row in group], device=device).argsort()
-    poses = Similarity(*(part[order] for part in poses)) if poses else None
-    return Fitted(codes[order], residuals[order], poses)
+        key = row if is_cpu(device) else (len(observation.points), observation.is_exact)
+        groups.setdefault(key, []).append(row)
+    work = [[observations[row] for row in rows] for rows in groups.values()]
+    parts = side_by_side(fit, work, least=1) if is_cpu(device) else list(map(fit, work))
+    order = torch.tensor([row for rows in groups.values() for row in rows], device=device).argsort()
+    poses = [part.poses for part in parts if part.poses is not None]
+    return Fitted(
+        torch.cat([part.codes for part in parts])[order],
+        torch.cat([part.residuals for part in parts])[order],
+        Similarity(*(torch.cat(column)[order] for column in zip(*poses, strict=True))) if poses else None,
+    )
 
 
 def is_cpu(device: torch.device) -> bool:
     """Whether shapes are fitted one by one, a thread each."""
     return device.type == "cpu"
-
-
-def joined(parts: Sequence[Fitted]) -> Fitted:
-    """The fits of several groups of shapes as one."""
-    poses = [part.poses for part in parts if part.poses is not None]
-    return Fitted(
-        torch.cat([part.codes for part in parts]),
-        torch.cat([part.residuals for part in parts]),
-        Similarity(*map(torch.cat, zip(*poses, strict=True))) if poses else None,
-    )
 
 
 @contextmanager

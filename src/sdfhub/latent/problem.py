@@ -51,13 +51,16 @@ class Rows(NamedTuple):
     ) -> "Rows":
         """B observations of equally many points as tensors; `soft` is their noise, at least `smallest`."""
         names = ("points", "low", "high", "unsigned")
-        parts = [torch.from_numpy(np.stack([getattr(each, name) for each in observations])) for name in names]
+        parts = [
+            torch.from_numpy(np.stack([getattr(shape, name) for shape in observations])) for name in names
+        ]
         soft = torch.tensor([max(smallest, observation.noise) for observation in observations])
         return cls(*(part.to(device) for part in (*parts, soft, torch.tensor(prior))))
 
     def some(self, shapes: Tensor | slice, every: int = 1) -> "Rows":
         """Every so many-th row of some shapes."""
-        return Rows(*(part[shapes][:, ::every] for part in self[:4]), self.soft[shapes], self.prior[shapes])
+        parts = [part[shapes][:, ::every] for part in self[:4]]
+        return Rows(*parts, *(part[shapes] for part in self[4:]))
 
     def turned(self, rotations: Tensor) -> "Rows":
         """The same with points under rotations, [3, 3] or [B, 3, 3]."""
@@ -142,7 +145,7 @@ class Problem:
         shapes, count = rows.low.shape
 
         def violation_of(copies: Tensor, *bounded: Tensor) -> Tensor:
-            single = Rows(*bounded, rows.soft, rows.prior)
+            single = Rows(*bounded, *rows[4:])
             if not self.has_pose:
                 return violation(self.decoder, copies, single, self.delta)[:, 0]
             pose = small_similarity(copies[:, self.size :])

@@ -1,26 +1,19 @@
 """Similarities x -> scale * rotation x + shift: from an observation's frame to the normalised one."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
+from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-SIZE = 7
-"""Numbers of a small similarity: log scale, rotation vector [3] in radians, shift [3]."""
-
+SIZE = 7  # numbers of a small similarity: log scale, rotation vector [3] in radians, shift [3]
 AXES = {"y": 1, "z": 2}
 
 
 class Similarity(NamedTuple):
-    """B similarities.
-
-    Args:
-        scale: [B], > 0.
-        rotation: [B, 3, 3], orthogonal, determinant 1.
-        shift: [B, 3].
-    """
+    """B similarities: scale [B], > 0; rotation [B, 3, 3], orthogonal, determinant 1; shift [B, 3]."""
 
     scale: Tensor
     rotation: Tensor
@@ -58,22 +51,18 @@ class PoseRange:
     """How far an observation's frame may be from the normalised one, and from where the search starts.
 
     Args:
-        turns: starts about the upright axis, evenly all around it, >= 1: any turn about it is found.
-        tilt: of the upright axis, degrees, > 0.
-        scale: largest factor by which sizes may be wrong, either way, > 1.
-        shift: of the centre along an axis, normalised frame, > 0.
+        turns: starts about the upright axis, evenly all around it: any turn about it is found.
+        tilt: of the upright axis, degrees.
+        scale: largest factor by which sizes may be wrong, either way.
+        shift: of the centre along an axis, normalised frame.
         up: the axis that points up.
     """
 
-    turns: int
-    tilt: float
-    scale: float
-    shift: float
-    up: str = "z"
-
-    def __post_init__(self):
-        if self.turns < 1 or min(self.tilt, self.shift) <= 0 or self.scale <= 1 or self.up not in AXES:
-            raise ValueError("turns >= 1, tilt > 0, shift > 0, scale > 1 and up y or z are wanted")
+    turns: PositiveInt
+    tilt: PositiveFloat
+    scale: Annotated[float, Field(gt=1)]
+    shift: PositiveFloat
+    up: Literal["y", "z"] = "z"
 
     def spread(self) -> Tensor:
         """[7] standard deviations of a small similarity: half the range, or half a step between turns."""
@@ -83,8 +72,8 @@ class PoseRange:
         spread[1 + AXES[self.up]] = math.pi / self.turns
         return spread
 
-    def holds(self, found: Similarity) -> Tensor:
+    def holds(self, poses: Similarity) -> Tensor:
         """[B] whether similarities lie within the range."""
-        upright = found.rotation[:, AXES[self.up], AXES[self.up]].clamp(-1, 1).acos()
-        is_near = (found.shift.abs() <= self.shift).all(1) & (upright <= math.radians(self.tilt))
-        return is_near & (found.scale.log().abs() <= math.log(self.scale))
+        tilt = poses.rotation[:, AXES[self.up], AXES[self.up]].clamp(-1, 1).acos()
+        is_near = (poses.shift.abs() <= self.shift).all(1) & (tilt <= math.radians(self.tilt))
+        return is_near & (poses.scale.log().abs() <= math.log(self.scale))

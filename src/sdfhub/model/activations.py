@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sdfhub.described import Described
-from sdfhub.model.derivatives import value_and_slope
+from sdfhub.model.derivatives import value_and_pullback
 
 
 class Activation(Described, nn.Module, ABC):
@@ -34,7 +34,8 @@ class Activation(Described, nn.Module, ABC):
 
     def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """a(x) and a'(x), both shaped like x and both differentiable."""
-        return value_and_slope(self, x)
+        value, pullback = value_and_pullback(self, x)
+        return value, pullback(torch.ones_like(value))
 
     def weight_bound(self, fan_in: int) -> float:
         """Half-width b of U(-b, b), the initial weights of the layer before, for `fan_in` inputs."""
@@ -50,12 +51,7 @@ class Activation(Described, nn.Module, ABC):
 
 
 class Elementwise(Activation):
-    """Any module that acts on each number by itself, such as `torch.nn.GELU`, as an activation.
-
-    Args:
-        function: the module.
-        first: whether it follows the layer that reads the encoded points.
-    """
+    """A module that acts on each number by itself, such as `torch.nn.GELU`, as an activation."""
 
     def __init__(self, function: nn.Module, first: bool = False):
         super().__init__(first)
@@ -66,7 +62,7 @@ class Elementwise(Activation):
 
 
 def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> Activation:
-    """One layer's activation of a class, a partial or a factory; of a module, which is copied.
+    """One layer's activation: a copy of a module, or what a class, partial or factory makes.
 
     Args:
         make: called with `first` where it takes such an argument.
@@ -76,24 +72,19 @@ def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> A
         ValueError: it makes no module.
     """
     if isinstance(make, nn.Module):
-        made = copy.deepcopy(make)
+        activation = copy.deepcopy(make)
     else:
-        arguments = inspect.signature(make).parameters
-        kind = getattr(make, "func", make)
+        arguments, kind = inspect.signature(make).parameters, getattr(make, "func", make)
         is_ours = isinstance(kind, type) and issubclass(kind, Activation)  # every module takes **kwargs
         takes_first = "first" in arguments or (is_ours and "kwargs" in arguments)
-        made = make(first=first) if takes_first else make()
-    if not isinstance(made, nn.Module):
-        raise ValueError(f"activation must make a torch.nn.Module, got {type(made).__name__}")
-    return made if isinstance(made, Activation) else Elementwise(made, first)
+        activation = make(first=first) if takes_first else make()
+    if not isinstance(activation, nn.Module):
+        raise ValueError(f"activation must make a torch.nn.Module, got {type(activation).__name__}")
+    return activation if isinstance(activation, Activation) else Elementwise(activation, first)
 
 
 def require_positive(**values: float) -> None:
-    """Refuses arguments that are not positive numbers.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Raises a ValueError that names an argument which is not a positive number."""
     for name, value in values.items():
         if isinstance(value, str) or not value > 0:
             raise ValueError(f"{name} must be positive, got {value!r}")
@@ -113,11 +104,6 @@ class Siren(Activation):
     """sin(omega x), with one omega for the first layer and one for the others.
 
     Source: Sitzmann et al. 2020, section 3.2: first layer U(-1/n, 1/n), others U(+-sqrt(6/n) / omega).
-
-    Args:
-        omega_0: frequency factor of the first layer, > 0.
-        omega_hidden: frequency factor of every other layer, > 0.
-        first: whether it follows the layer that reads the encoded points.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
@@ -148,11 +134,9 @@ class Hosc(Siren):
     Source: the paper's equation for HOSC (Serrano et al. 2024).
 
     Args:
-        omega_0: frequency factor of the first layer, > 0.
-        omega_hidden: frequency factor of every other layer, > 0.
+        omega_0, omega_hidden: as in `Siren`.
         beta: initial sharpness, > 0; near 0 a scaled sine, large a square wave.
-        learn_beta: whether beta is trained with the decoder's weights.
-        first: whether it follows the layer that reads the encoded points.
+        learn_beta: whether beta is trained.
     """
 
     def __init__(
@@ -183,16 +167,10 @@ class Finer(Siren):
     """sin(omega (|x| + 1) x): a sine whose frequency grows away from zero, so that biases choose frequencies.
 
     Initialised as SIREN is, but for the first layer's biases, which are spread over U(-k, k). The authors'
-    code holds |x| + 1 fixed while it differentiates; here it is differentiated, because a normal is the
-    field's own slope.
+    code holds |x| + 1 fixed while it differentiates; here, where a normal is the field's slope, it is not.
+    Frequencies reach (2k + 1) omega.
 
     Source: Liu et al. 2024 (FINER), and its published code for the first biases.
-
-    Args:
-        omega_0: frequency factor of the first layer at x = 0, > 0.
-        omega_hidden: frequency factor of every other layer at x = 0, > 0.
-        k: half-width of the first layer's initial biases, > 0; frequencies reach (2k + 1) omega.
-        first: whether it follows the layer that reads the encoded points.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, k: float, first: bool = False):
@@ -213,14 +191,9 @@ class Finer(Siren):
 
 
 class Gauss(Activation):
-    """exp(-x^2 / (2 a^2)).
+    """exp(-x^2 / (2 a^2)); a narrow bump gives features of higher rank and a steeper field.
 
-    Source: Ramasinghe and Lucey 2022; they draw weights by several laws and find that it matters
-    little for this activation.
-
-    Args:
-        a: width of the bump, > 0; a narrow one gives features of higher rank and a steeper field.
-        first: whether it follows the layer that reads the encoded points.
+    Source: Ramasinghe and Lucey 2022, who find that the law of the initial weights matters little for it.
     """
 
     def __init__(self, a: float, first: bool = False):
@@ -239,17 +212,10 @@ class Gauss(Activation):
 class Wire(Siren):
     """cos(omega x) exp(-(s x)^2), initialised as PyTorch's linear layers are.
 
-    The real part of the complex Gabor wavelet exp(i omega x) exp(-|s x|^2), which would need complex weights.
-    The real layer in the authors' code has weights of its own for the bump; here wave and bump share one
-    linear map, as they do in the complex layer.
+    The real part of the complex Gabor wavelet exp(i omega x) exp(-|s x|^2), whose wave and bump share one
+    linear map, as here; the real layer in the authors' code has two.
 
     Source: Saragadam et al. 2023 (WIRE), and its published code.
-
-    Args:
-        omega_0: frequency of the first layer's wave, > 0.
-        omega_hidden: frequency of the wave in every other layer, > 0.
-        s: inverse width of the bump, > 0.
-        first: whether it follows the layer that reads the encoded points.
     """
 
     def __init__(self, omega_0: float, omega_hidden: float, s: float, first: bool = False):

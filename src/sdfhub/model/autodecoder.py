@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -36,11 +36,11 @@ class AutoDecoder(L.LightningModule):
         shapes: S, rows of the code table, >= 1; `SdfDataModule.rows` tells how many there are.
         codes: makes the table, called with `shapes` and `size`.
         loss: the objective and its weights.
-        optim: makes the optimiser and its schedule; also a partial of an optimiser (`Optimisation.of`).
+        optim: an `Optimisation`, or a partial of an optimiser (`Optimisation.of`).
         computing: how steps are computed; by default as the device likes it.
         validation: scores a shape of `val_dataloader`; None validates nothing.
-        seed: every step's randomness (dropout) derives from it and the step's number, so that a resumed
-            run repeats an uninterrupted one.
+        seed: a step's randomness derives from it and the step's number, so that a resumed run repeats an
+            uninterrupted one.
     """
 
     def __init__(
@@ -59,16 +59,20 @@ class AutoDecoder(L.LightningModule):
         self.loss, self.optim = loss or SdfLoss(), Optimisation.of(optim or Optimisation())
         self.computing, self.validation, self.seed = computing or Computing(), validation, seed
         parts = {"decoder": decoder, "codes": codes, "loss": self.loss, "optim": self.optim}
-        parts |= {"computing": self.computing, "validation": validation}
-        plain = {name: describe(part, name) for name, part in parts.items()}
-        self.save_hyperparameters({**plain, "shapes": shapes, "seed": seed}, logger=False)
+        parts |= {"computing": self.computing, "validation": validation, "shapes": shapes, "seed": seed}
+        self.save_hyperparameters({name: describe(part, name) for name, part in parts.items()}, logger=False)
         self.steps = math.inf
         self._value, self._value_and_gradient = decoder.forward, decoder.value_and_gradient
         self._step_started = time.perf_counter()
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: Any = "cpu", trust: str | Sequence[str] = (), **_: Any
+        cls,
+        checkpoint_path: Any,
+        map_location: Any = "cpu",
+        *_: Any,
+        trust: str | Sequence[str] = (),
+        **__: Any,
     ) -> Self:
         """The model of a checkpoint with its weights. Runs no code of the file.
 
@@ -82,11 +86,9 @@ class AutoDecoder(L.LightningModule):
         """
         path = Path(checkpoint_path)
         content = read_checkpoint(path, map_location)
-        parameters, weights = content.get("hyper_parameters"), content.get("state_dict")
-        model = model_with_weights(
-            lambda: cls(**built_parts(parameters, path, trust)), parameters, weights, path
-        )
-        return model.to(map_location)
+        parameters = content.get("hyper_parameters")
+        make = lambda: cls(**built_parts(parameters, path, trust))  # noqa: E731
+        return model_with_weights(make, parameters, content.get("state_dict"), path).to(map_location)
 
     def forward(self, points: Tensor, rows: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of the shapes in table rows [B]."""
@@ -101,7 +103,7 @@ class AutoDecoder(L.LightningModule):
     def on_fit_end(self) -> None:
         # Lightning has moved the model to the CPU by now, and of the plain encoding its weights alone
         self.decoder.encoding = self.decoder.encoding.plain().to(self.device)
-        self.computing.put_back()
+        torch.set_float32_matmul_precision("highest")  # what is trained is judged with all its digits
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         batches = self.trainer.accumulate_grad_batches
@@ -110,20 +112,14 @@ class AutoDecoder(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss, parts = self.objective(batch, self.progress)
-        if not torch.isfinite(loss):
-            self._refuse_divergence("loss", parts)
-        every = self.trainer.log_every_n_steps  # 0: nothing is logged
+        self._refuse_divergence("loss", {name: part.detach() for name, part in parts.items()})
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined] # 0: nothing is logged
         if every and (self.global_step + 1) % every == 0:
             self._log(batch, parts, loss)
         return loss
 
     def objective(self, batch: Batch, progress: float) -> tuple[Tensor, Parts]:
-        """The loss of a batch, which a step lowers, and its weighted parts, whose sum it is.
-
-        Args:
-            batch: of training shapes.
-            progress: share of training done, in [0, 1].
-        """
+        """The loss of a batch at a share of training in [0, 1], and its weighted parts, whose sum it is."""
         device = batch.sdf.device
         limit, threads = self.computing.together(device, batch.sdf.numel()), self.computing.threads(device)
         learned = [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -140,12 +136,11 @@ class AutoDecoder(L.LightningModule):
 
     def validation_step(self, shape: Any, batch_idx: int) -> None:
         """Scores one shape of `val_dataloader`: `val/...` of held-out shapes, `train/...` of known ones."""
-        if self.validation is None:
-            return
-        scores = self.validation(self.decoder, shape, self.codes.table)
-        role = "val" if shape.role == "held_out" else "train"
-        named = {f"{role}/{name}": value for name, value in scores.items()}
-        self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
+        if self.validation:
+            scores = self.validation(self.decoder, shape, self.codes.table)
+            role = "val" if shape.role == "held_out" else "train"
+            named = {f"{role}/{name}": value for name, value in scores.items()}
+            self.log_dict(named, batch_size=1, on_epoch=True, sync_dist=self.trainer.world_size > 1)
 
     @property
     def progress(self) -> float:
@@ -157,12 +152,9 @@ class AutoDecoder(L.LightningModule):
         # this has opened the data loader; a resumed training opens it again, once it knows its step
         self.trainer.fit_loop._combined_loader = None
         if math.isinf(self.steps):
-            raise SdfhubError(
-                "trainer.max_epochs: schedules and warm-ups are shares of a training; set it or max_steps"
-            )
-        optimizer, schedule = self.optim.configure(
-            self.decoder.parameters(), self.codes.parameters(), int(self.steps)
-        )
+            raise SdfhubError("trainer.max_epochs: set it or max_steps; schedules are shares of a training")
+        weights = self.decoder.parameters(), self.codes.parameters()
+        optimizer, schedule = self.optim.configure(*weights, steps=int(self.steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(
@@ -170,22 +162,20 @@ class AutoDecoder(L.LightningModule):
     ) -> None:
         # Lightning clips no gradients of a fused optimiser under mixed precision, for fear of a loss scale
         if gradient_clip_val is not None and gradient_clip_val > 0:
-            weights = [p for group in optimizer.param_groups for p in group["params"]]
             by_value = gradient_clip_algorithm == "value"
             clip = torch.nn.utils.clip_grad_value_ if by_value else torch.nn.utils.clip_grad_norm_
-            clip(weights, gradient_clip_val)
+            clip(self.parameters(), gradient_clip_val)
 
     def on_before_optimizer_step(self, optimizer) -> None:
-        gradients = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
-        if not torch.isfinite(torch.nn.utils.get_total_norm(gradients.values())):
-            self._refuse_divergence("gradient", gradients)
+        weights = self.named_parameters()
+        self._refuse_divergence("gradient", {name: p.grad for name, p in weights if p.grad is not None})
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        weights = dict(self.named_parameters())
-        if not torch.isfinite(torch.nn.utils.get_total_norm(weights.values())):
-            self._refuse_divergence("model", weights)
+        self._refuse_divergence("model", dict(self.named_parameters()))
 
-    def _refuse_divergence(self, what: str, parts: dict[str, Tensor]) -> None:
+    def _refuse_divergence(self, what: str, parts: Mapping[str, Tensor]) -> None:
+        if torch.isfinite(torch.nn.utils.get_total_norm(parts.values())):
+            return
         wrong = [name for name, part in parts.items() if not torch.isfinite(part).all()]
         culprits = f"{', '.join(wrong[:3])}{' ...' * (len(wrong) > 3)}" if wrong else "its norm"
         raise SdfhubError(
@@ -194,13 +184,13 @@ class AutoDecoder(L.LightningModule):
         )
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
-        values = {f"loss/{name}": part.detach() for name, part in parts.items()}
-        values["codes/norm"] = self.codes.table[batch.rows].detach().norm(dim=-1).mean()
+        values = {f"loss/{name}": float(part.detach()) for name, part in parts.items()}
+        values["codes/norm"] = float(self.codes.table[batch.rows].detach().norm(dim=-1).mean())
         for index, activation in enumerate(self.decoder.activations):
             values |= {f"{name}/layer_{index}": value for name, value in activation.monitored().items()}
         shared = self.trainer.world_size > 1  # processes then log the mean over their shares of the batch
         self.log("loss/total", loss.detach(), prog_bar=True, sync_dist=shared)
-        self.log_dict({name: float(value) for name, value in values.items()}, sync_dist=shared)
+        self.log_dict(values, sync_dist=shared)
 
     def on_train_batch_end(self, outputs, batch: Batch, batch_idx: int) -> None:
         seconds = time.perf_counter() - self._step_started

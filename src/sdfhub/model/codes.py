@@ -16,8 +16,7 @@ class CodeTable(Described, nn.Module):
     Args:
         shapes: S, number of rows.
         size: L, numbers in a code.
-        max_norm: longest norm a code may have, or None for no limit; longer ones are shortened when codes
-            are read.
+        max_norm: longer codes are shortened to it when they are read; None for no limit.
     """
 
     def __init__(self, shapes: int, size: int, max_norm: float | None = None):

@@ -29,8 +29,7 @@ class Layer(Described, nn.Module, ABC):
     """A linear layer over [hidden | encoding], steered by a code; it holds the weights of `linear`.
 
     Args:
-        hidden, encoding: number of input columns of each part; 0 leaves the part out.
-        code: L, numbers in the code; 0 leaves the layer unconditioned.
+        hidden, encoding, code: columns H, F and L of each part; 0 leaves the part out.
         outputs: W, number of output features.
 
     Attributes:
@@ -47,26 +46,17 @@ class Layer(Described, nn.Module, ABC):
 
     @abstractmethod
     def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
-        """Product [B, N, W], linear in the inputs, and the shift [B, 1, W] or [W] to be added to it.
+        """Product [B, N, W], linear in the inputs [B, N, H + F], and the shift by codes [B, L] added to it.
 
-        Args:
-            inputs: [B, N, H + F], hidden features and encoded points.
-            codes: [B, L].
+        The shift is [B, 1, W] or [W].
         """
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
-        """Cotangents of hidden and encoding from the output's.
-
-        Args:
-            cotangent: [B, N, W].
-            codes: [B, L].
-        """
+        """Cotangents of hidden and encoding from the output's [B, N, W], with codes [B, L]."""
         hidden, encoding, _ = self.columns
         anywhere = cotangent.new_zeros(*cotangent.shape[:-1], hidden + encoding)  # the Jacobian is constant
-        _, pullback = value_and_pullback(lambda inputs: self(inputs, codes)[0], anywhere)
-        return tuple(
-            part if part.shape[-1] else None for part in pullback(cotangent).split([hidden, encoding], -1)
-        )
+        pulled = value_and_pullback(lambda inputs: self(inputs, codes)[0], anywhere)[1](cotangent)
+        return pulled[..., :hidden] if hidden else None, pulled[..., hidden:] if encoding else None
 
 
 class Concat(Layer):
@@ -80,26 +70,25 @@ class Concat(Layer):
     joins_code = True
 
     def forward(self, inputs: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
-        from_points, from_code = self.linear.weight.split([sum(self.columns[:2]), self.columns[2]], dim=1)
-        shift = self.linear.bias
-        if self.columns[2]:
+        hidden, encoding, code = self.columns
+        from_points, from_code = self.linear.weight.split([hidden + encoding, code], dim=1)
+        shift: Tensor = self.linear.bias
+        if code:
             with full_precision(codes):  # one error here moves a whole shape
                 shift = F.linear(codes, from_code, self.linear.bias)[:, None]
-        with (
-            nullcontext() if self.columns[0] else full_precision(inputs)
-        ):  # bfloat16 cannot tell points apart
+        with nullcontext() if hidden else full_precision(inputs):  # bfloat16 cannot tell points apart
             return F.linear(inputs, from_points), shift
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
-        parts = self.linear.weight.split(self.columns, dim=1)[:2]
-        return tuple(cotangent @ part if part.shape[1] else None for part in parts)
+        by_hidden, by_encoding, _ = self.linear.weight.split(self.columns, dim=1)
+        hidden, encoding, _ = self.columns
+        return cotangent @ by_hidden if hidden else None, cotangent @ by_encoding if encoding else None
 
 
 class Film(Concat):
     """The code scales and shifts a layer's output: (1 + s(z)) (W x + b) + t(z).
 
-    s and t are one linear map of the code, a layer's own; pi-GAN has a mapping network before it, which a
-    table of free codes needs less than a generator's noise does.
+    s and t are one linear map of the code, a layer's own, without pi-GAN's mapping network before it.
 
     Source: Perez et al. 2018 (FiLM); Chan et al. 2021 (pi-GAN) for sines.
     """
@@ -114,15 +103,16 @@ class Film(Concat):
         product, bias = super().forward(inputs, codes)
         if self.film is None:
             return product, bias
-        scale, shift = self._scale_and_shift(codes)
+        scale, shift = self._scale_and_shift(self.film, codes)
         return (product * scale).to(product.dtype), scale * bias + shift
 
     def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
         if self.film is not None:
-            cotangent = cotangent * self._scale_and_shift(codes)[0]
+            cotangent = cotangent * self._scale_and_shift(self.film, codes)[0]
         return super().pullback(cotangent, codes)
 
-    def _scale_and_shift(self, codes: Tensor) -> tuple[Tensor, Tensor]:
+    @staticmethod
+    def _scale_and_shift(film: nn.Linear, codes: Tensor) -> tuple[Tensor, Tensor]:
         with full_precision(codes):  # one error here moves a whole shape
-            scale, shift = self.film(codes)[:, None].chunk(2, dim=-1)
+            scale, shift = film(codes)[:, None].chunk(2, dim=-1)
             return 1 + scale, shift

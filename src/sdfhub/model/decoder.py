@@ -1,6 +1,8 @@
 """The decoder f_theta(x, z): an MLP from encoded points and a shape's code to a signed distance."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,35 +20,26 @@ HEAD_SPREAD = 0.03
 
 
 def activated(
-    activation: Activation,
-    product: Tensor,
-    shift: Tensor,
-    beside: Tensor | None = None,
-    dropout: float = 0.0,
-    sloped: bool = False,
+    activation: Activation, product: Tensor, shift: Tensor, dropout: float = 0.0, sloped: bool = False
 ) -> tuple[Tensor, Tensor | None]:
-    """[a(product + shift) | beside], [B, N, W + F], and the slope a'(product + shift), [B, N, W].
+    """a(product + shift) and, where `sloped`, a'(product + shift), [B, N, W] with the dtype of `product`.
 
     Args:
         activation: a.
         product: [B, N, W].
         shift: [W] or [B, 1, W] float32.
-        beside: [B, N, F], what the next layer reads beside the activation; None for nothing.
         dropout: probability in [0, 1) that a unit and its slope are 0; others are divided by 1 - dropout.
         sloped: whether the slope is wanted; else it is None.
-
-    Returns:
-        Both with the dtype of `product`.
     """
-    if not dropout and waves.fits(activation, product):
-        return waves.wave(activation, product, shift, beside, sloped)
+    if not dropout and waves.fits(activation, product, shift):
+        return waves.wave(activation, product, shift, sloped)
     x = product + shift
     value, slope = activation.with_slope(x) if sloped else (activation(x), None)
     value, slope = value.to(product.dtype), None if slope is None else slope.to(product.dtype)
     if dropout:
         factors = dropout_factors(value, dropout)
         value, slope = value * factors, None if slope is None else slope * factors
-    return value if beside is None else torch.cat([value, beside.to(value.dtype)], dim=-1), slope
+    return value, slope
 
 
 class Decoder(Described, nn.Module):
@@ -84,7 +77,7 @@ class Decoder(Described, nn.Module):
         weight_norm: bool = True,
         dropout: float = 0.0,
         tanh: bool = False,
-        conditioning: Callable[..., Layer] = Concat,
+        conditioning: type[Layer] | partial[Layer] = Concat,
     ):
         super().__init__()
         if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
@@ -96,36 +89,39 @@ class Decoder(Described, nn.Module):
             raise ValueError(f"inject_encoding and inject_code name layers 1 to {depth}")
         self.encoding, self.code_size = as_encoding(encoding), code_size
         self.dropout, self.tanh = dropout, tanh
-        self.activations = nn.ModuleList(new_activation(activation, index == 0) for index in range(depth))
-        joins_code = getattr(conditioning, "func", conditioning).joins_code
-        self.layers = nn.ModuleList()
-        hidden = 0
+        activations = [new_activation(activation, index == 0) for index in range(depth)]
+        kind: Any = conditioning.func if isinstance(conditioning, partial) else conditioning
+        layers: list[Layer] = []
+        hidden, features = 0, self.encoding.features
         for index in range(depth + 1):
-            encoded = encoding.features if index == 0 or index in inject_encoding else 0
-            code = code_size if index == 0 or index in inject_code else 0
-            after = encoding.features * (index + 1 in inject_encoding)
-            after += code_size * (index + 1 in inject_code) * joins_code
+            after = features * (index + 1 in inject_encoding)
+            after += code_size * (index + 1 in inject_code) * kind.joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
                 raise ValueError(
                     f"width {width} leaves no room for {after} re-injected features; "
                     "widen it, encode with fewer features, or set shorten=false"
                 )
-            self.layers.append(conditioning(hidden, encoded, code, outputs))
+            encoded = features if index == 0 or index in inject_encoding else 0
+            code = code_size if index == 0 or index in inject_code else 0
+            layers.append(conditioning(hidden, encoded, code, outputs))
             hidden = outputs
-        self._initialize()
+        self._initialize(layers, activations)
         if weight_norm:
-            for layer in self.layers[:-1]:
+            for layer in layers[:-1]:
                 with_weight_norm(layer.linear)  # after the weights are drawn, so that their law is kept
+        self.activations: Sequence[Activation] = nn.ModuleList(activations)  # type: ignore[assignment]
+        self.layers: Sequence[Layer] = nn.ModuleList(layers)  # type: ignore[assignment]
 
+    @staticmethod
     @torch.no_grad()
-    def _initialize(self) -> None:
-        for layer, activation in zip(self.layers, self.activations, strict=False):
+    def _initialize(layers: Sequence[Layer], activations: Sequence[Activation]) -> None:
+        for layer, activation in zip(layers, activations, strict=False):
             bound = activation.weight_bound(layer.linear.in_features)
             layer.linear.weight.uniform_(-bound, bound)
-            if (bound := activation.bias_bound()) is not None:
-                layer.linear.bias.uniform_(-bound, bound)
-        head = self.layers[-1].linear
+            if (spread := activation.bias_bound()) is not None:
+                layer.linear.bias.uniform_(-spread, spread)
+        head = layers[-1].linear
         head.weight.normal_(0, HEAD_SPREAD / head.in_features**0.5)
         head.bias.zero_()
 
@@ -142,8 +138,9 @@ class Decoder(Described, nn.Module):
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
-            beside = encoded if following.columns[1] else None
-            inputs, slope = activated(activation, product, shift, beside, dropout, sloped)
+            inputs, slope = activated(activation, product, shift, dropout, sloped)
+            if following.columns[1]:
+                inputs = torch.cat([inputs, encoded.to(inputs.dtype)], dim=-1)
             slopes.append(slope)
         with full_precision(inputs):  # nor distances
             product, shift = self.layers[-1](inputs.to(encoded.dtype), codes)
@@ -168,6 +165,7 @@ class Decoder(Described, nn.Module):
         for layer, slope in zip(reversed(self.layers), [*reversed(slopes), None], strict=True):
             by_hidden, part = layer.pullback(cotangent, codes)
             by_encoding = by_encoding if part is None else by_encoding + part
-            cotangent = None if slope is None else by_hidden * slope
+            if by_hidden is not None and slope is not None:
+                cotangent = by_hidden * slope
         with full_precision(points):
             return sdf, to_space(by_encoding)

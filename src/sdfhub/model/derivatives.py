@@ -1,22 +1,19 @@
-"""Derivatives by autograd of what states none of its own: an activation's slope, an encoding's Jacobian.
-
-Neither is traced by `torch.compile`, which cannot differentiate twice what it has compiled once.
-"""
+"""Derivatives by autograd, for activations, encodings and layers that state none of their own."""
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+Pullback = Callable[[Tensor], Tensor]
+"""From a cotangent of a function's value to one of its argument."""
 
-@torch.compiler.disable
-def value_and_pullback(
-    function: Callable[[Tensor], Tensor], at: Tensor
-) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+
+@torch.compiler.disable  # which cannot differentiate twice what it has compiled once
+def value_and_pullback(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Pullback]:
     """f(x), and the map of a cotangent v, shaped like f(x), to J(x)^T v, shaped like x.
 
-    Both are differentiable where gradients are on; where they are off, or in inference mode, both are plain
-    numbers.
+    Both are differentiable where gradients are on, else plain numbers.
 
     Args:
         function: twice differentiable.
@@ -31,14 +28,7 @@ def value_and_pullback(
     def pullback(cotangent: Tensor) -> Tensor:
         if not value.requires_grad:  # a constant function
             return torch.zeros_like(leaf)
-        return torch.autograd.grad(
-            value, leaf, cotangent, retain_graph=True, create_graph=differentiable, materialize_grads=True
-        )[0]
+        settings = {"retain_graph": True, "create_graph": differentiable, "materialize_grads": True}
+        return torch.autograd.grad(value, leaf, cotangent, **settings)[0]
 
     return value if differentiable else value.detach(), pullback
-
-
-def value_and_slope(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
-    """f(x) and f'(x), both shaped like x, of an elementwise function; differentiable as above."""
-    value, pullback = value_and_pullback(function, at)
-    return value, pullback(torch.ones_like(value))

@@ -7,19 +7,15 @@ the normal loss differentiates the field's spatial gradient by the weights. It m
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from sdfhub.described import Described
-from sdfhub.model.derivatives import value_and_pullback
+from sdfhub.model.derivatives import Pullback, value_and_pullback
 
 PRIMES = (1, 2_654_435_761, 805_459_861)
 """Factors of the spatial hash. Source: Mueller et al. 2022, section 3."""
-
-Pullback = Callable[[Tensor], Tensor]
-"""From a cotangent of the features [..., F] to one of the points [..., 3]."""
 
 
 class Encoding(Described, nn.Module, ABC):
@@ -45,27 +41,24 @@ class Encoding(Described, nn.Module, ABC):
 
 
 class OfModule(Encoding):
-    """Any module from points [..., 3] to features [..., F], with an attribute `features`, as an encoding."""
+    """A module from points [..., 3] to features [..., F], with an attribute `features`, as an encoding."""
 
-    def __init__(self, module: nn.Module):
+    def __init__(self, module: nn.Module, features: int):
         super().__init__()
-        self.module, self.features = module, module.features
+        self.module, self.features = module, features
 
     def forward(self, points: Tensor) -> Tensor:
         return self.module(points)
 
 
 def as_encoding(module: nn.Module) -> Encoding:
-    """The encoding itself, or a module as one.
-
-    Raises:
-        ValueError: it is no module, or has no number of features.
-    """
+    """An encoding itself, or a module as one; raises a ValueError where it has no integer `features`."""
     if isinstance(module, Encoding):
         return module
-    if not isinstance(module, nn.Module) or not isinstance(getattr(module, "features", None), int):
+    features = getattr(module, "features", None)
+    if not isinstance(module, nn.Module) or not isinstance(features, int):
         raise ValueError("encoding must be a torch.nn.Module with an integer attribute `features`")
-    return OfModule(module)
+    return OfModule(module, features)
 
 
 class Identity(Encoding):
@@ -81,12 +74,7 @@ class Identity(Encoding):
 
 
 class Waves(Encoding):
-    """sin and cos of angles that are linear in x: F = 2 A (+ 3), for A angles.
-
-    Args:
-        angles: A.
-        include_points: whether the coordinates themselves come first among the features.
-    """
+    """sin and cos of A angles that are linear in x, after x itself where `include_points`: F = 2 A (+ 3)."""
 
     def __init__(self, angles: int, include_points: bool):
         super().__init__()
@@ -123,11 +111,9 @@ class Fourier(Waves):
     """sin(2^k pi x) and cos(2^k pi x) for k = 0 ... frequencies - 1, per axis: F = 6 frequencies (+ 3).
 
     Source: Mildenhall et al. 2020, equation 4; the paper's "FFT".
-
-    Args:
-        frequencies: number of octaves, >= 1.
-        include_points: whether the coordinates themselves come first among the features.
     """
+
+    octaves: Tensor
 
     def __init__(self, frequencies: int, include_points: bool = False):
         super().__init__(3 * frequencies, include_points)
@@ -145,12 +131,12 @@ class Fourier(Waves):
 class Gaussian(Waves):
     """sin(2 pi B x) and cos(2 pi B x) with rows of B drawn once from N(0, sigma^2): F = 2 rows.
 
-    Source: Tancik et al. 2020, section 5. B is a buffer: it is saved with the weights.
+    sigma is in cycles per unit of the normalised frame. B is a buffer: it is saved with the weights.
 
-    Args:
-        rows: number of random directions, >= 1.
-        sigma: standard deviation of their entries, in cycles per unit of the normalised frame, > 0.
+    Source: Tancik et al. 2020, section 5.
     """
+
+    directions: Tensor
 
     def __init__(self, rows: int, sigma: float):
         super().__init__(rows, include_points=False)
@@ -179,9 +165,11 @@ class Hash(Encoding):
         log2_table: base-2 logarithm of the rows of a level's table.
         coarsest: cells along an axis of the first grid, over [-1, 1].
         finest: cells along an axis of the last grid; geometric in between.
-        include_points: whether the coordinates come first among the features (a table alone gives no slope
-            between shapes).
+        include_points: whether x comes first among the features; tables alone start with no slope.
     """
+
+    cells: Tensor
+    starts: Tensor
 
     def __init__(
         self,
@@ -206,7 +194,7 @@ class Hash(Encoding):
         self.features = levels * width + 3 * include_points
         self.table = nn.Parameter(torch.empty(sum(self.rows), width).uniform_(-1e-4, 1e-4))
         self.register_buffer("cells", torch.tensor(cells), persistent=False)
-        self.register_buffer("first", torch.tensor([0, *self.rows]).cumsum(0)[:-1], persistent=False)
+        self.register_buffer("starts", torch.tensor([0, *self.rows]).cumsum(0)[:-1], persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
         return self._encode(points)[0]
@@ -229,9 +217,9 @@ class Hash(Encoding):
         return features, pullback
 
     def _encode(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-        """Features and what they are made of, for P points in all, K levels and C features a level.
+        """Features and what they are made of, for P points, K levels and C features a level.
 
-        Points are the last axis while it is worked on: long rows are what a CPU is fast at.
+        Points are the last axis: long rows are what a CPU is fast at.
 
         Returns:
             features: [..., F].
@@ -254,15 +242,11 @@ class Hash(Encoding):
         return features, corners, (x, y, z), 3 * t * (1 - t) * self.cells[:, None]
 
     def _rows_of(self, low: Tensor) -> Tensor:
-        """Table rows [2, 2, 2, K, P] of the corners of cells with low corners [3, K, P].
-
-        A grid that fits its table is indexed directly, the others by the spatial hash. Each axis is worked
-        out for its two vertices before they are combined into eight.
-        """
+        """Table rows [2, 2, 2, K, P] of the corners of cells with low corners [3, K, P]."""
         pairs = torch.stack([low, low + 1], dim=1)  # [3, 2, K, P]
         last = self.cells[: self.dense, None]
         x, y, z = torch.minimum(pairs[:, :, : self.dense].clamp(min=0), last)  # jitter may leave the cube
         fitting = ((x[:, None] * (last + 1) + y)[:, :, None] * (last + 1)) + z
         x, y, z = (axis * prime for axis, prime in zip(pairs[:, :, self.dense :], PRIMES, strict=True))
         hashed = ((x[:, None] ^ y)[:, :, None] ^ z) % max(self.rows)
-        return torch.cat([fitting, hashed], dim=-2) + self.first[:, None]
+        return torch.cat([fitting, hashed], dim=-2) + self.starts[:, None]

@@ -3,8 +3,9 @@
 A rival is a subclass of `Loss` that overrides `__call__` or, to have its terms logged apart, `parts`.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from pydantic.dataclasses import dataclass
 from torch import Tensor
@@ -15,38 +16,24 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 def clamped_l1(predicted: Tensor, target: Tensor, delta: float) -> Tensor:
-    """Mean of |clamp(f, delta) - clamp(d, delta)|: a scalar.
+    """Mean of |clamp(f, delta) - clamp(d, delta)| of field values and signed distances, [B, N]: a scalar.
 
-    Source: the paper's L1 loss (Park et al. 2019, equation 4). A prediction outside [-delta, delta] whose
-    target lies outside on the same side costs nothing and gets no gradient.
+    A prediction outside [-delta, delta] whose target lies outside on the same side gets no gradient.
 
-    Args:
-        predicted: [B, N] field values.
-        target: [B, N] signed distances, normalised frame.
-        delta: half-width of the band in which distances count, > 0.
+    Source: the paper's L1 loss (Park et al. 2019, equation 4).
     """
     return (predicted.clamp(-delta, delta) - target.clamp(-delta, delta)).abs().mean()
 
 
 def code_prior(codes: Tensor, norm: Literal["squared", "l2"]) -> Tensor:
-    """Mean over shapes of |z|^2 (both papers) or |z| (DeepSDF's published code): a scalar.
-
-    Args:
-        codes: [B, L].
-        norm: which of the two.
-    """
+    """Mean over the shapes of codes [B, L] of |z|^2 (both papers) or |z| (DeepSDF's code): a scalar."""
     squared = codes.square().sum(dim=-1)
     # the floor keeps the derivative of the root finite at z = 0
     return squared.mean() if norm == "squared" else squared.clamp(min=1e-12).sqrt().mean()
 
 
 def normal_term(gradients: Tensor, normals: Tensor) -> Tensor:
-    """Mean over points of |grad_x f - n|^2: a scalar. Source: the paper's final loss.
-
-    Args:
-        gradients: [B, M, 3] spatial gradients of the field on the surface.
-        normals: [B, M, 3] outward unit normals there.
-    """
+    """Mean over points of |grad_x f - n|^2, both [B, M, 3]: a scalar. Source: the paper's final loss."""
     return (gradients - normals).square().sum(dim=-1).mean()
 
 
@@ -54,8 +41,7 @@ class Loss(Described):
     """What a training lowers.
 
     Attributes:
-        delta: half-width of the band in which distances count, > 0, for what reads it beside the training:
-            the fit of unseen shapes and their error.
+        delta: half-width of the band in which distances count, > 0, also in fits of unseen shapes.
     """
 
     delta: float = 0.1
@@ -64,17 +50,9 @@ class Loss(Described):
         """Whether spatial gradients are given at this share of training, in [0, 1]; they cost time."""
         return False
 
-    def __call__(
-        self,
-        predicted: Tensor,
-        target: Tensor,
-        codes: Tensor,
-        gradients: Tensor | None,
-        normals: Tensor | None,
-        progress: float,
-    ) -> Tensor:
+    def __call__(self, *arguments: Any, **named: Any) -> Tensor:
         """The loss, a scalar; arguments as in `parts`."""
-        return sum(self.parts(predicted, target, codes, gradients, normals, progress).values())
+        return torch.stack(tuple(self.parts(*arguments, **named).values())).sum()
 
     def parts(
         self,
@@ -87,8 +65,8 @@ class Loss(Described):
     ) -> dict[str, Tensor]:
         """Weighted terms by name; their sum is the loss.
 
-        A large batch is worked on in pieces, so a term must be a mean: over samples or shapes, or, for a
-        term named `normal`, over surface points.
+        A large batch is worked on in pieces, so a term is a mean: over surface points for one named
+        `normal`, else over samples or shapes.
 
         Args:
             predicted: [B, N] field values.
@@ -111,9 +89,9 @@ class SdfLoss(Loss):
         delta: clamp of signed distances, normalised frame, > 0.
         lambda_code: weight of the code prior, >= 0.
         code_norm: `squared` for |z|^2 or `l2` for |z|.
-        warmup: share of training in [0, 1] over which lambda_code grows linearly from 0.
+        warmup: share of training over which lambda_code grows linearly from 0.
         tau: weight of the normal term, >= 0; 0 switches it off.
-        tau_start: share of training in [0, 1) before which tau is 0: normals cost time before they pay.
+        tau_start: share of training before which tau is 0: normals cost time before they pay.
     """
 
     delta: PositiveFloat = 0.1
@@ -137,10 +115,8 @@ class SdfLoss(Loss):
     ) -> dict[str, Tensor]:
         """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
-        parts = {
-            "sdf": clamped_l1(predicted, target, self.delta),
-            "code": self.lambda_code * warmup * code_prior(codes, self.code_norm),
-        }
-        if gradients is not None:
+        parts = {"sdf": clamped_l1(predicted, target, self.delta)}
+        parts["code"] = self.lambda_code * warmup * code_prior(codes, self.code_norm)
+        if gradients is not None and normals is not None:
             parts["normal"] = self.tau * normal_term(gradients, normals)
         return parts

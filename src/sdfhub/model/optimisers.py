@@ -18,11 +18,9 @@ Schedule = Callable[[float], float]
 
 @dataclass(frozen=True)
 class StepDecay:
-    """Multiplied by `factor` after each `every` of training (DeepSDF: halved every 500 of 2000 epochs).
+    """Multiplied by `factor`, in (0, 1], after each share `every` of training, in (0, 1].
 
-    Args:
-        every: share of training between two steps, in (0, 1].
-        factor: what each step multiplies by, in (0, 1].
+    Source: DeepSDF halves its rates every 500 of 2000 epochs.
     """
 
     every: Annotated[float, Field(gt=0, le=1)]
@@ -35,11 +33,7 @@ class StepDecay:
 
 @dataclass(frozen=True)
 class Cosine:
-    """Half a cosine from 1 to `final`.
-
-    Args:
-        final: factor at the end, in [0, 1].
-    """
+    """Half a cosine from 1 to `final`, in [0, 1]."""
 
     final: Annotated[float, Field(ge=0, le=1)] = 0.0
 
@@ -55,11 +49,10 @@ class Optimisation:
         lr_decoder: initial learning rate of the decoder, > 0.
         lr_codes: initial learning rate of the codes, > 0.
         schedule: factor of both over the share of training; None keeps them.
-        warmup_steps: over which both first rise from 0; no more than half of training. Counted in steps, not
-            as a share: a short training needs it as much as a long one, or its first steps throw the field
-            out of [-delta, delta], where the clamped loss has no gradient.
-        optimizer: makes an optimiser of groups of parameters, such as a class of `torch.optim` or a partial
-            of one. Its fused implementation is taken where it has one.
+        warmup_steps: over which both first rise from 0; no more than half of training. Without, the first
+            steps of a training, short or long, throw the field out of [-delta, delta], where the clamped
+            loss has no gradient.
+        optimizer: a class of `torch.optim` or a partial of one; fused where it can be.
     """
 
     lr_decoder: PositiveFloat = 2e-3
@@ -70,12 +63,10 @@ class Optimisation:
 
     @classmethod
     def of(cls, make: Any) -> "Optimisation":
-        """The optimisation itself, or one that is made of a partial.
+        """An optimisation itself, or that of a partial of this class or of an optimiser.
 
-        Args:
-            make: an `Optimisation`; a partial of the class; or a partial of an optimiser, such as
-                `partial(torch.optim.AdamW, lr_decoder=1e-3, lr_codes=1e-2, weight_decay=0.01)`, whose
-                keywords may be those of this class too. Its `lr` stands for a rate that is not given.
+        An optimiser's, such as `partial(torch.optim.AdamW, lr_decoder=1e-3, weight_decay=0.01)`, may have
+        keywords of this class too; its `lr` stands for a rate that is not given.
         """
         if hasattr(make, "configure"):
             return make
@@ -91,10 +82,8 @@ class Optimisation:
         self, decoder: Iterable[nn.Parameter], codes: Iterable[nn.Parameter], steps: int
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LambdaLR]:
         """The optimiser and its schedule, to be stepped after each of `steps` training steps."""
-        groups = [
-            {"params": list(decoder), "lr": self.lr_decoder, "name": "decoder"},
-            {"params": list(codes), "lr": self.lr_codes, "name": "codes"},
-        ]
+        rates = (("decoder", decoder, self.lr_decoder), ("codes", codes, self.lr_codes))
+        groups = [{"params": list(weights), "lr": rate, "name": name} for name, weights, rate in rates]
         chosen = getattr(self.optimizer, "keywords", {}).keys() & {"fused", "foreach", "differentiable"}
         can_fuse = "fused" in inspect.signature(self.optimizer).parameters and not chosen
         optimizer = self.optimizer(groups, fused=True) if can_fuse else self.optimizer(groups)

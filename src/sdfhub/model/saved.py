@@ -1,11 +1,13 @@
 """A model from what a file holds: descriptions of its parts, and weights that agree with them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from sdfhub.described import built
 from sdfhub.errors import SdfhubError
@@ -33,40 +35,32 @@ def built_parts(parameters: Any, path: Path, trust: str | Sequence[str] = ()) ->
 def saved_decoder(
     description: Any, weights: Mapping[str, Tensor], path: Path, trust: str | Sequence[str] = ()
 ) -> Decoder:
-    """The decoder of a description, with its weights, in evaluation mode and without gradients.
-
-    Args:
-        description: plain data.
-        weights: the decoder's `state_dict`.
-        path: the file, for messages.
-        trust: packages beside sdfhub whose classes may be built.
+    """The decoder of a plain description with its `state_dict`, in evaluation mode and without gradients.
 
     Raises:
-        SdfhubError: the weights are those of another decoder.
+        SdfhubError: the weights are those of another decoder, or a class is of a package not in `trust`.
     """
-
-    def make() -> Decoder:
-        return built(description, "decoder", trust, within="sdfhub.model")
-
-    decoder = model_with_weights(make, description, weights, path)
-    return decoder.eval().requires_grad_(False)
+    make = partial(built, description, "decoder", trust, within="sdfhub.model")
+    return model_with_weights(make, description, weights, path).eval().requires_grad_(False)
 
 
 def model_with_weights(make: Callable[[], Model], description: Any, weights: Any, path: Path) -> Model:
-    """A model with its weights. Nothing is made that is larger than the weights.
+    """The model that `make` makes of a description, with its `state_dict`.
 
-    A few bytes of description could ask for a model without bounds.
-
-    Args:
-        make: the untrained model of the description.
-        description: plain data; its node `decoder`, or all of it.
-        weights: the model's `state_dict`.
-        path: the file, for messages.
+    Nothing is made that is larger than the weights: a few bytes of description could ask for any size.
 
     Raises:
-        SdfhubError: the description is none, or that of another model.
+        SdfhubError: the description is none, or that of another model; names the file.
     """
-    _refuse_outsized(description, weights, path)
+    if not isinstance(weights, Mapping) or not all(
+        isinstance(weight, Tensor) and weight.is_contiguous() for weight in weights.values()
+    ):  # a view may claim more numbers than its file holds
+        raise SdfhubError(f"{path}: holds no weights of a model; give a checkpoint that a training wrote")
+    size = sum(weight.numel() for weight in weights.values())
+    decoder = description.get("decoder", description) if isinstance(description, Mapping) else {}
+    for value in tree_leaves(decoder):
+        if isinstance(value, int | float) and value > max(size, 64):
+            raise SdfhubError(f"{path}: {value} is more than a decoder of {size} weights can have")
     try:
         with torch.device("meta"):
             expected = make().state_dict()
@@ -82,27 +76,3 @@ def model_with_weights(make: Callable[[], Model], description: Any, weights: Any
     except (RuntimeError, TypeError, AttributeError, ArithmeticError) as error:
         raise SdfhubError(f"{path}: describes no model: {error}") from error
     return model
-
-
-def _refuse_outsized(description: Any, weights: Any, path: Path) -> None:
-    if not isinstance(weights, Mapping) or not all(
-        isinstance(weight, Tensor) and weight.is_contiguous() for weight in weights.values()
-    ):  # a view may claim more numbers than its file holds
-        raise SdfhubError(f"{path}: holds no weights of a model; give a checkpoint that a training wrote")
-    numbers = sum(weight.numel() for weight in weights.values())
-    decoder = description.get("decoder", description) if isinstance(description, Mapping) else {}
-    for key, value in _numbers(decoder, "decoder"):
-        if value > max(numbers, 64):
-            raise SdfhubError(f"{path}: {key}={value} is more than a decoder of {numbers} weights can have")
-
-
-def _numbers(node: Any, key: str) -> Iterator[tuple[str, float]]:
-    """Every number of a plain node, with its dotted key."""
-    if isinstance(node, Mapping):
-        for name, value in node.items():
-            yield from _numbers(value, f"{key}.{name}")
-    elif isinstance(node, list):
-        for value in node:
-            yield from _numbers(value, key)
-    elif isinstance(node, int | float) and not isinstance(node, bool):
-        yield key, node

@@ -1,6 +1,7 @@
 """What a search for settings asks of its trainings, and how many of them are left."""
 
 import os
+from math import inf
 from statistics import geometric_mean, mean, median
 from typing import Any
 
@@ -9,11 +10,11 @@ from sdfhub.report.results import ROLES, ShapeScore
 NOISE = 1e-6  # excess that 30,000 points a side cannot tell from none, normalised units squared
 
 
-def objective(metrics: dict[str, Any]) -> float | None:
+def objective(metrics: dict[str, Any]) -> float:
     """What a search lowers: the geometric mean of mean and median excess CD of both roles, in `metrics.json`.
 
     A factor counts alike in each of the four; a median alone would not see one broken shape of eight. Sources
-    without meshes are judged by the error of distances. None where nothing was judged, as after a failure.
+    without meshes are judged by the error of distances. Infinite after a failure, where nothing was judged.
     """
     judged = [metrics[role]["shapes"] for role in ROLES if metrics.get(role, {}).get("shapes")]
     errors = [
@@ -21,7 +22,7 @@ def objective(metrics: dict[str, Any]) -> float | None:
         for rows in judged
     ]
     printed = [max(statistic(values), NOISE) for values in errors for statistic in (mean, median)]
-    return geometric_mean(printed) if printed else None
+    return geometric_mean(printed) if printed else inf
 
 
 def trials_left(total: int, storage: str, study: str) -> int:

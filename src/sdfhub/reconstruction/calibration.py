@@ -7,11 +7,13 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import NonNegativeInt, PositiveFloat
+from pydantic.dataclasses import dataclass
 from tqdm import tqdm
 
 from sdfhub.checkpoint_file import LAST
@@ -26,8 +28,8 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
+# what is judged: kept beside the settings, so that limits of another rule are not taken for these
 RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
-"""What is judged: kept beside the settings, so that limits of another rule are not taken for these."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +38,22 @@ class Calibration:
 
     Args:
         shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
-        spread: standard deviations that a value's logarithm may lie above the mean of theirs, > 0.
-        reach: times the largest of theirs, however far theirs spread, > 0.
+        spread: standard deviations that a value's logarithm may lie above the mean of theirs.
+        reach: times the largest of theirs, however far theirs spread.
     """
 
-    shapes: int
-    spread: float
-    reach: float
+    shapes: NonNegativeInt
+    spread: PositiveFloat
+    reach: PositiveFloat
 
     def __post_init__(self):
-        if (self.shapes < 3 and self.shapes != 0) or min(self.spread, self.reach) <= 0:
-            raise ValueError("shapes must be at least 3, or 0 for no verdicts; spread and reach positive")
+        if 0 < self.shapes < 3:
+            raise ValueError("shapes must be at least 3, or 0 for no verdicts")
 
     def limit(self, values: np.ndarray) -> float:
         """The value above which a fit is doubtful, from those [S] of shapes known to be of the kind."""
         values = np.maximum(values, 1e-12)  # a limit of 0 would have no multiples
-        logarithms = np.log(values)
-        usual = np.exp(logarithms.mean() + self.spread * logarithms.std(ddof=1))
+        usual = np.exp(np.log(values).mean() + self.spread * np.log(values).std(ddof=1))
         return float(min(usual, self.reach * np.max(values)))
 
     def limits(
@@ -63,12 +64,12 @@ class Calibration:
         reconstructor: Reconstructor,
         unseen_shapes: Callable[[int], list[StoredShape]],
     ) -> dict[ScanKind, Limits]:
-        """The limits of each kind of scan: the run's own, or measured now and kept.
+        """The limits of kinds of scans: the run's own, or measured now and kept.
 
         Args:
             run: its folder.
             settings: plain, all that fits depend on.
-            kinds: that are wanted.
+            kinds: which are wanted.
             reconstructor: fits scans.
             unseen_shapes: up to so many shapes of the run's data that it was not trained on.
 
@@ -88,7 +89,7 @@ class Calibration:
             known = kept.get(key, {}) | known | {str(kind): entry}
             try:
                 write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
-            except OSError as error:  # somebody else's run: the limits serve this command at least
+            except OSError as error:  # another user's run: the limits serve this command at least
                 log.warning("%s: is not kept: %s", run / FILE, error.strerror)
         return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
 
@@ -103,8 +104,8 @@ class Calibration:
             residuals.append(float(fitted.residuals))
             doubts.append(float(reconstructor.doubts(fitted)))
         limits = Limits(self.limit(np.array(residuals)), self.limit(np.array(doubts)))
-        entry = {"limits": asdict(limits), "residuals": residuals, "doubts": doubts}
-        return entry | {"shapes": [shape.id for shape in shapes]}
+        ids = [shape.id for shape in shapes]
+        return {"limits": asdict(limits), "residuals": residuals, "doubts": doubts, "shapes": ids}
 
 
 def digest(run: Path, settings: dict[str, Any]) -> str:

@@ -74,14 +74,10 @@ class Reconstructor:
         """Meshes in the scans' own frames, and the matrices [4, 4] from the normalised frame to these."""
         for row, mesh in enumerate(self.space.meshes(fitted.codes, self.resolution)):
             matrix = to_scan(scans[row], fitted, row)
-            yield (mesh[0] @ matrix[:3, :3].T + matrix[:3, 3], mesh[1]), matrix
+            yield Mesh(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.faces), matrix
 
     def reconstruct(
-        self,
-        scans: Mapping[str, ObservedScan],
-        limits: Mapping[ScanKind, Limits],
-        out: Path,
-        together: int,
+        self, scans: Mapping[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path, together: int
     ) -> Iterator[Result]:
         """Fits and meshes scans by name and writes NAME.ply and NAME.json of each, as they are found.
 
@@ -110,7 +106,9 @@ class Reconstructor:
         scans, results = list(group.values()), []
         fitted = self.fitted(scans)
         doubts = self.doubts(fitted).tolist()
-        near = self.poses.holds(fitted.poses).tolist() if self.poses else [True] * len(group)
+        near = [True] * len(group)
+        if self.poses and fitted.poses:
+            near = self.poses.holds(fitted.poses).tolist()
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
             result = Result(

@@ -1,4 +1,4 @@
-"""What was found of one scan: code, mesh and verdict, as NAME.ply and NAME.json and as a line of a table."""
+"""The reconstruction of one scan: code, mesh and verdict, as NAME.ply and NAME.json and a line of a table."""
 
 import json
 from collections.abc import Sequence
@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from sdfhub.whole_file import write_whole
+
+Verdict = Literal["fitted", "doubtful", "unjudged", "failed"]
 
 
 @dataclass(frozen=True)
@@ -39,29 +41,25 @@ class Result:
     residual: float | None = None
     doubt: float | None = None
     limits: Limits | None = None
-    verdict: Literal["fitted", "doubtful", "unjudged", "failed"] = "failed"
+    verdict: Verdict = "failed"
     reason: str = ""
     code: tuple[float, ...] = ()
     frame: tuple[tuple[float, ...], ...] = ()
     mesh: str | None = None
 
     def judged(self, limits: Limits | None, is_near: bool) -> "Result":
-        """The same with a verdict.
-
-        Args:
-            limits: for its kind of scan; None where nothing was calibrated.
-            is_near: whether its pose lies within the range of poses.
-        """
+        """The same with a verdict; `is_near` tells whether its pose lies within the range of poses."""
+        verdict: Verdict = "doubtful"
         if self.mesh is None:
-            verdict, reason = "doubtful", "the field has no surface"
+            reason = "the field has no surface"
         elif not is_near:
-            verdict, reason = "doubtful", "no pose within poses.scale, poses.tilt and poses.shift was found"
-        elif limits is None:
+            reason = "no pose within poses.scale, poses.tilt and poses.shift was found"
+        elif limits is None or self.residual is None or self.doubt is None:
             verdict, reason = "unjudged", "nothing was calibrated"
         else:
-            pairs = ("residual", self.residual, limits.residual), ("doubt", self.doubt, limits.doubt)
-            beyond = [f"{name} {has / most:.2f} x its limit" for name, has, most in pairs if not has <= most]
-            verdict, reason = "doubtful" if beyond else "fitted", ", ".join(beyond)
+            shares = {"residual": self.residual / limits.residual, "doubt": self.doubt / limits.doubt}
+            reason = ", ".join(f"{name} {x:.2f} x its limit" for name, x in shares.items() if not x <= 1)
+            verdict = "doubtful" if reason else "fitted"
         return replace(self, limits=limits, verdict=verdict, reason=reason)
 
     def write(self, out: Path) -> None:
@@ -81,12 +79,14 @@ def is_result(path: Path) -> bool:
 def table(results: Sequence[Result]) -> str:
     """A line a scan: verdict, residual and doubt beside their limits, times 10^3, what it was judged as."""
     width = max(len("scan"), *(len(result.name) for result in results)) + 2
-    head = f"{'residual':>10}{'at most':>9}{'doubt':>11}{'at most':>11}  judged as (numbers times 10^3)"
-    lines = [f"{'scan':<{width}}{'verdict':<10}{head}"]
+    lines = [
+        f"{'scan':<{width}}{'verdict':<10}{'residual':>10}{'at most':>9}{'doubt':>11}{'at most':>11}  "
+        "judged as (numbers times 10^3)"
+    ]
     for result in results:
-        most = (result.limits.residual, result.limits.doubt) if result.limits else (None, None)
-        numbers = ((result.residual, 10), (most[0], 9), (result.doubt, 11), (most[1], 11))
+        residual, doubt = (result.limits.residual, result.limits.doubt) if result.limits else (None, None)
+        numbers = (result.residual, 10), (residual, 9), (result.doubt, 11), (doubt, 11)
         cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
-        why = f"; {result.reason}" if result.reason and result.verdict != "failed" else ""
-        lines.append(f"{result.name:<{width}}{result.verdict:<10}{''.join(cells)}  {result.kind}{why}")
+        reason = f"; {result.reason}" if result.reason and result.verdict != "failed" else ""
+        lines.append(f"{result.name:<{width}}{result.verdict:<10}{''.join(cells)}  {result.kind}{reason}")
     return "\n".join(lines)

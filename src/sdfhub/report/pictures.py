@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +15,7 @@ import trimesh
 from PIL import Image
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.data.workers import stream_in_processes, workers_worth
+from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.render import render
 from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
@@ -59,7 +60,7 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
             return None
-        frame = Frame(truth.center, truth.scale) if truth else Frame.around(vertices)[0]
+        frame = truth.frame if truth else Frame.around(vertices)[0]
     except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
         return None
     return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")
@@ -103,7 +104,8 @@ def contact_sheets(groups: list[Group], count: int, find_truth: FindTruth) -> li
     sheets = [_sheet(group, count, find_truth) for group in groups]
     tiles = [tile for sheet in sheets for _, row in sheet.rows for tile in row if tile.read]
     readers = [tile.read for tile in tiles]
-    images: Any = stream_in_processes(picture, readers, workers_worth(len(readers), A_WORKERS_WORTH))
+    workers = min(os.cpu_count() or 1, len(readers) // A_WORKERS_WORTH)
+    images: Any = stream_in_processes(picture, readers, workers)
     for tile, image in zip(tiles, images, strict=True):
         tile.image, tile.text = image, "no mesh" if image is None else tile.text
     return sheets

@@ -1,21 +1,17 @@
-"""What a point cloud says about its surface: spacing, noise, tangent planes, which side is outside."""
+"""What points say about their surface: spacing, noise, tangent planes, which side is outside, empty space."""
 
 import igl
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 10
-"""Points that a tangent plane is fitted to."""
-
+NEIGHBOURS = 10  # points that a tangent plane is fitted to
+# points that noise is measured on: of more, neighbours would lie within the noise of each other
 ENOUGH = 8192
-"""Points that noise is measured on: of more, neighbours would lie within the noise of each other."""
-
+# places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)
 QUIETEST, SHARE = 0.3, 0.817
-"""Places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)."""
-
-EDGE = 1.2
-"""Half the edge of the cube in which the outside is flooded, normalised frame."""
+EDGE = 1.2  # half the edge of the cube in which the outside is flooded, normalised frame
+RAYS = 4  # rays nearest to a place that must all have passed it
 
 
 def spacing_of(points: np.ndarray) -> float:
@@ -29,8 +25,7 @@ def noise_of(points: np.ndarray) -> float:
     How far neighbours scatter about their plane, at the flattest places: at edges and thin parts no plane
     fits. A curved surface looks a little noisy.
     """
-    some = points[:: max(1, -(-len(points) // ENOUGH))]
-    _, scatter = tangent_planes(some)
+    _, scatter = tangent_planes(points[:: max(1, -(-len(points) // ENOUGH))])
     unbiased = np.sqrt(NEIGHBOURS / (NEIGHBOURS - 3))  # a plane takes three numbers
     return float(np.quantile(scatter, QUIETEST) * unbiased / SHARE)
 
@@ -43,20 +38,19 @@ def tangent_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return axes[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0))
 
 
+def grid_of(axis: np.ndarray) -> np.ndarray:
+    """[n^3, 3] the nodes of a cubic grid with these coordinates [n] along each axis."""
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
 def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> np.ndarray:
     """[Q] whether places `at` [Q, 3] can be reached from afar without coming near a cloud [N, 3].
 
-    A flood fill of the cube [-1.2, 1.2]^3. Where the cloud has gaps wider than twice the reach, it comes in.
-
-    Args:
-        points, at: normalised frame.
-        reach: how near is near; more than the gaps between points, less than the parts between them.
-        cells: of the cube along an axis.
+    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`; it comes in where the
+    cloud has gaps wider than twice that.
     """
-    axis = np.linspace(-EDGE, EDGE, cells)
-    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    tree = cKDTree(points)
-    near = np.isfinite(tree.query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
+    nodes = grid_of(np.linspace(-EDGE, EDGE, cells))
+    near = np.isfinite(cKDTree(points).query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
     pieces, _ = label(np.pad(~near, 1, constant_values=True))  # afar is free, though the corners may be near
     cell = np.rint((at + EDGE) / (2 * EDGE) * (cells - 1)).astype(np.int64).clip(0, cells - 1) + 1
     return pieces[tuple(cell.T)] == pieces[0, 0, 0]
@@ -67,16 +61,56 @@ def cell_radius(cells: int) -> float:
     return 3**0.5 * EDGE / (cells - 1)
 
 
+def winding(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """[Q] winding numbers of an oriented cloud about the points `at` [Q, 3]: near 1 inside, 0 outside.
+
+    Source: Barill et al. 2018, with the areas [N] that points stand for.
+    """
+    return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
+
+
 def areas_of(points: np.ndarray) -> np.ndarray:
     """[N] the area that each point stands for: a disc up to its neighbours, shared with them."""
     distance = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[0]
     return np.pi * distance[:, -1] ** 2 / (distance.shape[1] - 1)
 
 
-def winding(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """[Q] winding numbers of an oriented cloud about the points `at` [Q, 3]: near 1 inside, 0 outside.
+def free_space(
+    points: np.ndarray, sensor: np.ndarray, cells: int, background: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places that a sensor saw to be empty, and how far at least they are from any surface.
 
-    Source: Barill et al. 2018.
+    A cell of the cube is free if the rays nearest to it, no further apart than rays are from each other,
+    ended a cell behind it. Its distance to the nearest cell that is not free bounds that to any surface,
+    seen or unseen.
+
+    Args:
+        points: [N, 3] where rays ended, normalised frame.
+        sensor: [3] where they began.
+        cells: along an axis of [-1, 1]^3.
+        background: whether what no ray ended near is empty all along.
+
+    Returns:
+        centres [K, 3] of free cells and lower bounds [K] of the distance there, >= 0.
     """
-    tree = np.ascontiguousarray(points), np.ascontiguousarray(normals), np.ascontiguousarray(areas)
-    return igl.fast_winding_number(*tree, np.ascontiguousarray(at, np.float64))
+    size = 2 / cells
+    centres = grid_of(-1 + size * (np.arange(cells) + 0.5))
+    rays, reached = _directions(points - sensor)
+    towards, depth = _directions(centres - sensor)
+    tree = cKDTree(rays)
+    wide = 2 * np.median(tree.query(rays, 2)[0][:, 1])
+    # a cell is as wide as its own rays: no other may end in it
+    apart, near = tree.query(towards, RAYS, distance_upper_bound=float(max(wide, 0.02)))
+    is_free = np.zeros(len(centres), bool)
+    rows = np.flatnonzero(np.isfinite(apart).all(axis=1))
+    is_free[rows] = depth[rows] < reached[near[rows]].min(axis=1) - size
+    if background:
+        is_free |= np.isinf(apart).all(axis=1)
+    padded = np.pad(is_free.reshape((cells,) * 3), 1)  # nothing is known beyond the cube
+    clear = distance_transform_edt(padded)[1:-1, 1:-1, 1:-1].ravel()[is_free]
+    return centres[is_free], np.maximum(clear - np.sqrt(3), 0) * size
+
+
+def _directions(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    length = np.linalg.norm(vectors, axis=1)
+    return vectors / np.maximum(length, 1e-12)[:, None], length

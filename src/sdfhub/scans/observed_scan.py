@@ -19,16 +19,10 @@ from sdfhub.shapes import NORMALIZED, Frame, Observation
 ScanFrame = Frame | Literal["shape", "unknown"]
 """How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
 
-MOST = 2**16
-"""Points of a cloud that are used: a random draw of more."""
-
+MOST = 2**16  # points of a cloud that are used: a random draw of more
+# distance of the farthest point from the origin that a scan in the normalised frame may have
 LARGEST, SMALLEST = 1.2, 0.2
-"""Distance of the farthest point from the origin that a scan in the normalised frame may have."""
-
-FAR = 2.5
-"""The same of signed samples, which are also drawn around the shape."""
-
-WHOLE = "give frame=shape if it is whole"
+FAR = 2.5  # the same of signed samples, which are also drawn around the shape
 
 
 @dataclass(frozen=True)
@@ -58,23 +52,27 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
         SdfhubError: the scan does not fit the frame; RejectedMesh where its mesh cannot be trusted.
     """
     if scan.faces is not None:
-        return _observe_mesh(scan, evidence, frame, rng)
+        return _observe_mesh(scan.points, scan.faces, evidence, frame, rng)
     if scan.kind == "view" and frame == "shape":
         raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
     if isinstance(frame, Frame):
         lies = frame
     else:
-        lies = NORMALIZED if scan.sdf is not None else box_frame(scan.points)
+        lies = NORMALIZED if scan.sdf is not None else _box_frame(scan.points)
     points = lies.to_normalized(scan.points)
-    advice = WHOLE if scan.sdf is None else "signed samples belong there"
-    refuse_misplaced(points, LARGEST if scan.sdf is None else FAR, advice)
+    _refuse_misplaced(points, LARGEST if scan.sdf is None else FAR)
     if np.ptp(points, axis=0).max() < SMALLEST:
         raise SdfhubError("its points all lie in one place")
     if scan.sdf is not None:
         observation = evidence.of_samples(points, scan.sdf * lies.scale, rng)
         lies = scan.frame if scan.frame is not None and lies is NORMALIZED else lies
         return ObservedScan("samples", len(points), observation, lies)
-    points, normals = thinned(*distinct(points, scan.normals), rng)
+    # repeated points would look infinitely dense
+    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    if len(rows) < LEAST:
+        raise SdfhubError(f"holds {len(rows)} different points; at least {LEAST} are needed to know a shape")
+    rows = rows[rng.permutation(len(rows))[:MOST]] if len(rows) > MOST else rows
+    points, normals = points[rows], None if scan.normals is None else scan.normals[rows]
     if scan.sensor is None:
         observation = evidence.of_cloud(points, normals, rng)
     else:
@@ -82,18 +80,19 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
     return ObservedScan(scan.kind, len(points), observation, lies)
 
 
-def _observe_mesh(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
+def _observe_mesh(
+    vertices: np.ndarray, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
+) -> ObservedScan:
     if isinstance(frame, Frame):
-        refuse_misplaced(frame.to_normalized(scan.points), LARGEST, WHOLE)
+        _refuse_misplaced(frame.to_normalized(vertices), LARGEST)
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
-    prepared = prepare_mesh((scan.points, scan.faces), preparation)
-    points, sdf = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64)
-    own = Frame(prepared.center, prepared.scale)
+    prepared = prepare_mesh((vertices, faces), preparation)
+    points, sdf, own = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64), prepared.frame
     if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
-        seen = observe(Scan(own.to_source(points), sdf=sdf / own.scale), evidence, frame, rng)
+        observed = observe(Scan(own.to_source(points), sdf=sdf / own.scale), evidence, frame, rng)
     else:
-        seen = observe(Scan(points, sdf=sdf, frame=own), evidence, NORMALIZED, rng)
-    return replace(seen, count=len(scan.points))
+        observed = observe(Scan(points, sdf=sdf, frame=own), evidence, NORMALIZED, rng)
+    return replace(observed, count=len(vertices))
 
 
 def observations_of(
@@ -116,45 +115,16 @@ def observations_of(
     return observations
 
 
-def refuse_misplaced(points: np.ndarray, largest: float, advice: str) -> None:
-    """Refuses points [N, 3] of another frame than the normalised one.
-
-    Raises:
-        SdfhubError: the farthest lies nearer to the origin than SMALLEST or farther than `largest`.
-    """
+def _refuse_misplaced(points: np.ndarray, largest: float) -> None:
+    """Refuses points [N, 3] of another frame than the normalised one."""
     reach = float(np.linalg.norm(points, axis=1).max())
     if not SMALLEST <= reach <= largest:
-        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1; {advice}")
+        advice = "; give frame=shape if it is whole" if largest == LARGEST else ""
+        raise SdfhubError(f"reaches {reach:.3g} from the origin, the normalised frame about 1{advice}")
 
 
-def distinct(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Each place of points [N, 3] once, with its first normal: repeated ones would look infinitely dense.
-
-    Raises:
-        SdfhubError: too few are left.
-    """
-    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])
-    if len(rows) < LEAST:
-        raise SdfhubError(f"holds {len(rows)} different points; at least {LEAST} are needed to know a shape")
-    return points[rows], None if normals is None else normals[rows]
-
-
-def thinned(
-    points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """At most MOST of the points [N, 3] and of their normals."""
-    if len(points) <= MOST:
-        return points, normals
-    kept = rng.permutation(len(points))[:MOST]
-    return points[kept], None if normals is None else normals[kept]
-
-
-def box_frame(points: np.ndarray) -> Frame:
-    """The frame by which the box of points [N, 3] comes to 0 and the farthest to 1 / 1.03.
-
-    Raises:
-        SdfhubError: they lie in one place, on a line or in a plane, or too far out to be measured.
-    """
+def _box_frame(points: np.ndarray) -> Frame:
+    """The frame by which the box of points [N, 3] comes to 0 and the farthest to 1 / 1.03."""
     half = points.max(axis=0) / 2 - points.min(axis=0) / 2
     if half.min() >= 1e-3 * half.max() > 0:
         with suppress(ValueError):

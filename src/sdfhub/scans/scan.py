@@ -15,9 +15,8 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Frame
 
 FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
-LEAST = 50
-"""Points from which a shape may be guessed."""
-
+LEAST = 50  # points from which a shape may be guessed
+_PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
 _HEADER = re.compile(rb"\Aply\r?\n.*?end_header\r?\n", re.DOTALL)
 _FACES = re.compile(rb"^element\s+(?:face|tristrips)\s+[1-9]", re.MULTILINE)
 
@@ -45,9 +44,9 @@ class Scan:
     def __post_init__(self):
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype.kind != "f":
             raise ValueError(f"points must be [N, 3] numbers, they are {list(self.points.shape)}")
-        if len(self.points) < LEAST and self.faces is None:
-            raise ValueError(f"holds {len(self.points)} points; at least {LEAST} are needed to know a shape")
         count = len(self.points)
+        if count < LEAST and self.faces is None:
+            raise ValueError(f"holds {count} points; at least {LEAST} are needed to know a shape")
         shapes = {"points": (count, 3), "normals": (count, 3), "sdf": (count,), "sensor": (3,)}
         for name, shape in shapes.items():
             part = getattr(self, name)
@@ -88,17 +87,16 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: no such file")
     if path.stat().st_size > MAX_BYTES:
         raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
-    if not path.stat().st_size:
-        raise SdfhubError(f"{path}: the file is empty")
+    readers = {".ply": _ply, ".xyz": _text, ".npy": _array, ".npz": _archive}
     try:
-        return _READERS.get(path.suffix.lower(), _mesh)(path)
+        return readers.get(path.suffix.lower(), _mesh)(path)
     except RejectedMesh as rejection:
         raise SdfhubError(rejection.detail) from rejection
     except SdfhubError:
         raise
     except Exception as error:  # the readers raise whatever broken bytes lead to
-        what = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SdfhubError(f"{path}: {what}") from error
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SdfhubError(f"{path}: {reason}") from error
 
 
 def _mesh(path: Path) -> Scan:
@@ -110,7 +108,7 @@ def _ply(path: Path) -> Scan:
     content = path.read_bytes()
     header = _HEADER.match(content)
     if header is None:
-        raise SdfhubError(f"{path}: not a PLY file, or one that ends within its header")
+        raise ValueError("not a PLY file, or one that ends within its header")
     if _FACES.search(header[0]):
         return _mesh(path)
     import trimesh  # here: slow to import
@@ -119,16 +117,13 @@ def _ply(path: Path) -> Scan:
         check_length(content, ".ply")
         cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
         columns = cloud.metadata["_ply_raw"]["vertex"]["data"]
-        rows = [np.asarray(columns[name], np.float64).reshape(-1) for name in _columns(columns)]
+        names = columns.dtype.names if hasattr(columns, "dtype") else columns
+        wanted = ["x", "y", "z", "nx", "ny", "nz"]
+        wanted = wanted if set(wanted) <= set(names) else wanted[:3]
+        rows = [np.asarray(columns[name], np.float64).reshape(-1) for name in wanted]
     except Exception as error:  # whatever a cut or damaged file leads trimesh to
-        raise SdfhubError(f"{path}: cannot be read as ply; it may be cut off or damaged") from error
+        raise ValueError("cannot be read as ply; it may be cut off or damaged") from error
     return _cloud(np.stack(rows, axis=1))
-
-
-def _columns(there) -> list[str]:
-    names = there.dtype.names if hasattr(there, "dtype") else there
-    wanted = ["x", "y", "z", "nx", "ny", "nz"]
-    return wanted if set(wanted) <= set(names) else wanted[:3]
 
 
 def _cloud(rows: np.ndarray) -> Scan:
@@ -139,39 +134,28 @@ def _cloud(rows: np.ndarray) -> Scan:
 
 
 def _text(path: Path) -> Scan:
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except ValueError as error:
-        raise SdfhubError(f"{path}: not rows of numbers: {str(error).splitlines()[0]}") from error
-    return _cloud(rows)
+    return _cloud(np.loadtxt(path, ndmin=2))
 
 
 def _array(path: Path) -> Scan:
-    rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    rows = np.load(path, mmap_mode="r", allow_pickle=False)  # a header that claims more than the file fails
     if rows.dtype.kind != "f":
         raise ValueError(f"expected floating-point numbers, got {rows.dtype}")
     return _cloud(np.array(rows))
 
 
 def _archive(path: Path) -> Scan:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = {name.removesuffix(".npy") for name in archive.namelist()}
-    except zipfile.BadZipFile as error:
-        raise SdfhubError(f"{path}: cannot be read as npz; it may be cut off or damaged") from error
+    with zipfile.ZipFile(path) as archive:
+        names = {name.removesuffix(".npy") for name in archive.namelist()}
     if {"pos", "neg"} <= names:
         samples = read_samples(path)
         points, sdf = samples.points.astype(np.float64), samples.sdf.astype(np.float64)
-        return Scan(points, sdf=sdf, frame=Frame(samples.center, samples.scale))
+        return Scan(points, sdf=sdf, frame=samples.frame)
     if "points" not in names:
-        what = ", ".join(sorted(names)) or "nothing"
-        raise SdfhubError(f"{path}: holds {what}; expected pos and neg, points and sdf, or points")
+        contents = ", ".join(sorted(names)) or "nothing"
+        raise ValueError(f"holds {contents}; expected pos and neg, points and sdf, or points")
     parts = {name: npz_array(path, name).astype(np.float64) for name in names & _PARTS}
     if "sdf" not in parts:
         return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))
-    center, scale = parts.get("center", np.zeros(3)), parts.get("scale", np.ones(1))
-    return Scan(parts["points"], sdf=parts["sdf"], frame=Frame(center, float(scale.ravel()[0])))
-
-
-_PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
-_READERS = {".ply": _ply, ".xyz": _text, ".npy": _array, ".npz": _archive}
+    frame = Frame(parts.get("center", np.zeros(3)), float(parts.get("scale", np.ones(1)).ravel()[0]))
+    return Scan(parts["points"], sdf=parts["sdf"], frame=frame)

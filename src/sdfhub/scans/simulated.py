@@ -11,26 +11,20 @@ from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, NormalizedMesh
 
+# levels of noise that are told apart, normalised frame
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
-"""Levels of noise that are told apart, normalised frame."""
-
+# half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away
 HALF_VIEW = np.tan(np.radians(24))
-"""Half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away."""
-
-DISTANCE, HEIGHT = 2.5, 0.5
-"""Of sensors from the origin, and how far up they may stand, as a sine."""
-
+DISTANCE, HEIGHT = 2.5, 0.5  # of sensors from the origin, and how far up they may stand, as a sine
 PIXELS = 100
-LOOKS = 20
-"""Places tried for a sensor, until it sees enough points to know a shape."""
-
-VIEWS = 2
-"""Simulated of each shape: a view depends on where the sensor stood."""
+LOOKS = 20  # places tried for a sensor, until it sees enough points to know a shape
+VIEWS = 2  # simulated of each shape: a view depends on where the sensor stood
 
 
 @dataclass(frozen=True)
@@ -62,14 +56,11 @@ class ScanKind:
         return f"{self.kind}{count}" + (f", noise {self.noise:g}" if self.noise else "")
 
     def observations(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[ObservedScan]:
-        """Simulated scans of shapes, observed: one of each shape, several views."""
-        numbers = range(VIEWS if self.kind == "view" else 1)
-        return [self.observe(shape, evidence, number) for shape in shapes for number in numbers]
-
-    def observe(self, shape: StoredShape, evidence: Evidence, number: int = 0) -> ObservedScan:
-        """A simulated scan of a shape, in the normalised frame, observed; another number gives another."""
-        rng = np.random.default_rng([shape_seed(shape), number])
-        return observe(self.scan(shape, number), evidence, NORMALIZED, rng)
+        """Simulated scans of shapes, observed in the normalised frame: one of each shape, several views."""
+        pairs = [(shape, number) for shape in shapes for number in range(VIEWS if self.kind == "view" else 1)]
+        rngs = [np.random.default_rng([shape_seed(shape), number]) for shape, number in pairs]
+        scans = [self.scan(*pair) for pair in pairs]
+        return [observe(scan, evidence, NORMALIZED, rng) for scan, rng in zip(scans, rngs, strict=True)]
 
     def scan(self, shape: StoredShape, number: int = 0) -> Scan:
         """A simulated scan of a shape, in the normalised frame; another number gives another one.
@@ -94,7 +85,7 @@ class ScanKind:
         return Scan(points, normals if self.kind == "oriented" else None)
 
 
-def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
+def random_sensor(rng: np.random.Generator, up: UpAxis) -> np.ndarray:
     """[3] a place around the unit ball, not far above or below its middle."""
     height, turn = rng.uniform(-HEIGHT, HEIGHT), rng.uniform(0, 2 * np.pi)
     flat = np.sqrt(1 - height**2)
@@ -105,14 +96,7 @@ def random_sensor(rng: np.random.Generator, up: str) -> np.ndarray:
 def surface_scan(
     mesh: NormalizedMesh, count: int, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [count, 3] spread evenly over a mesh, moved by normal noise, and their faces' normals.
-
-    Args:
-        mesh: its faces turned outwards.
-        count: points.
-        noise: standard deviation along each axis, normalised frame.
-        rng: of the points.
-    """
+    """Points [count, 3] spread evenly over a mesh, moved by noise of that deviation, and normals there."""
     points, normals = sample_surface(mesh.vertices, mesh.faces, count, rng)
     return points + noise * rng.standard_normal(points.shape), normals
 
@@ -120,14 +104,9 @@ def surface_scan(
 def view_scan(
     mesh: NormalizedMesh, sensor: np.ndarray, pixels: int, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """What a sensor that looks at the origin sees of a mesh: [M, 3] points, at most one a pixel.
+    """What a sensor [3] outside the unit ball that looks at the origin sees of a mesh: [M, 3] points.
 
-    Args:
-        mesh: what stands there.
-        sensor: [3], outside the unit ball, normalised frame.
-        pixels: of the picture, either way.
-        noise: standard deviation along the rays.
-        rng: of the noise.
+    At most one of each of the picture's pixels * pixels; noise is the standard deviation along the rays.
     """
     scene = EmbreeScene()
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))

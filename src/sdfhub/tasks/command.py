@@ -8,18 +8,26 @@ import sys
 import sdfhub
 
 TASKS = {
-    "train": "learns a shape space: sdfhub train activation=hosc encoding=fourier",
-    "prepare": "makes samples ahead of time: sdfhub prepare data=open category=chairs",
-    "evaluate": "judges a finished run again: sdfhub evaluate RUN evaluate.resolution=512",
-    "export": "one file of a space, or its meshes: sdfhub export RUN safetensors",
-    "interpolate": "shapes between two: sdfhub interpolate RUN ID ID steps=8",
-    "sample": "new shapes of a space: sdfhub sample RUN n=8",
-    "neighbours": "the shapes most like one: sdfhub neighbours RUN ID (or a scan)",
-    "view": "a page on this machine to see, move, mix and fit shapes: sdfhub view RUN",
-    "import-deepsdf": "an experiment of DeepSDF's code becomes a run: sdfhub import-deepsdf EXPERIMENT_DIR",
-    "reconstruct": "finds the shapes behind scans: sdfhub reconstruct RUN scan.ply",
-    "report": "tables and a page from a sweep's folder: sdfhub report outputs/sweeps/table_small",
+    "train": ("", "learns a shape space: sdfhub train activation=hosc encoding=fourier"),
+    "prepare": ("", "makes samples ahead of time: sdfhub prepare data=open category=chairs"),
+    "evaluate": ("run", "judges a finished run again: sdfhub evaluate RUN evaluate.resolution=512"),
+    "export": ("run to", "one file of a space, or its meshes: sdfhub export RUN safetensors"),
+    "interpolate": ("run a b", "shapes between two: sdfhub interpolate RUN ID ID steps=8"),
+    "sample": ("run", "new shapes of a space: sdfhub sample RUN n=8"),
+    "neighbours": ("run of", "the shapes most like one: sdfhub neighbours RUN ID (or a scan)"),
+    "view": ("run", "a page on this machine to see, move, mix and fit shapes: sdfhub view RUN"),
+    "import-deepsdf": (
+        "folder",
+        "a run of DeepSDF becomes ours: sdfhub import-deepsdf EXPERIMENT",
+    ),
+    "reconstruct": ("run scans...", "finds the shapes behind scans: sdfhub reconstruct RUN scan.ply"),
+    "report": ("sweep", "tables and a page of a sweep: sdfhub report outputs/sweeps/table_small"),
 }
+"""The keys that a task's words without `=` stand for, and what it does.
+
+The task is the function of its name in the module of its name. Its YAML in conf/ has its name too; that of
+`train` is `config.yaml`.
+"""
 
 
 def main() -> None:
@@ -30,7 +38,7 @@ def main() -> None:
         sys.argv.insert(1, task := "train")
     if task in ("-h", "--help"):
         print("usage: sdfhub TASK [key=value ...]; sdfhub TASK --help tells its keys\n")
-        print("\n".join(f"  {name:<16}{about}" for name, about in TASKS.items()))
+        print("\n".join(f"  {name:<16}{about}" for name, (_, about) in TASKS.items()))
         return
     if task == "--version":
         print(f"sdfhub {sdfhub.__version__}")
@@ -39,8 +47,11 @@ def main() -> None:
         print(f"sdfhub: error: there is no task {task!r}; choose {', '.join(TASKS)}", file=sys.stderr)
         sys.exit(2)
     del sys.argv[1]
+    name = task.replace("-", "_")
     gc.disable()  # what imports make stays: looking it over for garbage is a fifth of a start
-    module = importlib.import_module(f"sdfhub.tasks.{task.replace('-', '_')}")
+    from sdfhub.tasks.app import run_task
+
+    function = getattr(importlib.import_module(f"sdfhub.tasks.{name}"), name)
     gc.freeze()
     gc.enable()
-    module.main()
+    run_task(function, "config" if task == "train" else name, TASKS[task][0].split())

@@ -12,7 +12,6 @@ from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import evaluate_model
 from sdfhub.opening import beside, data_of, load, read_run
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
@@ -74,8 +73,3 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str],
                 f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
             )
     return Split([offered[id] for id in train], [offered[id] for id in unseen])
-
-
-def main() -> None:
-    """Console entry: `sdfhub evaluate RUN evaluate.resolution=512`."""
-    run_task(evaluate, "evaluate", ["run"])

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch.export import Dim
 from tqdm import tqdm
 
+from sdfhub.composition import plain
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import FORMATS, write_mesh
 from sdfhub.model.decoder import Decoder
 from sdfhub.opening import beside, load, write_space
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import write_whole
 
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
@@ -48,7 +48,7 @@ def export(config: DictConfig) -> None:
 def export_meshes(config: DictConfig, folder: Path) -> None:
     """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
     suffix = check(config.format, Literal[FORMATS], "format")
-    chosen = OmegaConf.to_container(config)["shapes"]
+    chosen = check(plain(config)["shapes"], list[str | int] | str | int | None, "shapes")
     chosen = [chosen] if isinstance(chosen, str | int) else chosen
     space = load(config.run, trust=config.trust or ())
     rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]
@@ -75,7 +75,7 @@ def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
         return torch.export.export(decoder, example, dynamic_shapes=shapes)
 
 
-def function_file(function: torch.export.ExportedProgram, kind: Literal["onnx", "torch_export"]) -> bytes:
+def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
     """A function as the content of a file.
 
     Raises:
@@ -90,9 +90,11 @@ def function_file(function: torch.export.ExportedProgram, kind: Literal["onnx", 
             import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-        names = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
-        made = torch.onnx.export(function, **names, dynamo=True, verbose=False)
-        return _with_named_axes(made.model_proto).SerializeToString()
+        program = torch.onnx.export(
+            function, input_names=["points", "codes"], output_names=["sdf"], dynamo=True, verbose=False
+        )
+        assert program
+        return _with_named_axes(program.model_proto).SerializeToString()
 
 
 def _with_named_axes(model: Any) -> Any:
@@ -115,8 +117,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(logging.NOTSET)
-
-
-def main() -> None:
-    """Console entry: `sdfhub export RUN TO`."""
-    run_task(export, "export", ["run", "to"])

@@ -8,7 +8,6 @@ in training alone, so it does not bear on what an imported run computes.
 Source: github.com/facebookresearch/DeepSDF: networks/deep_sdf_decoder.py, deep_sdf/workspace.py.
 """
 
-import json
 import logging
 import shutil
 from collections.abc import Mapping
@@ -29,7 +28,6 @@ from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
 from sdfhub.opening import begin_run, load
 from sdfhub.shapes import Frame
-from sdfhub.tasks.app import run_task
 
 log = logging.getLogger(__name__)
 
@@ -65,35 +63,36 @@ class Specs(BaseModel):
     CodeRegularizationLambda: float = 1e-4
 
 
-def import_deepsdf(composed: DictConfig) -> Path:
-    """The task: `config` as conf/import_deepsdf.yaml has it. Returns the run's folder."""
+def import_deepsdf(composed: DictConfig) -> None:
+    """The task: a config as conf/import_deepsdf.yaml has it."""
     config = plain(composed)
     folder, epoch = Path(check(config["folder"], str, "folder")), check(config["epoch"], str | int, "epoch")
     out, split = (check(config[key], str | None, key) for key in ("out", "split"))
-    run = Path(out) if out else Path(config["paths"]["output"]) / "deepsdf" / folder.resolve().name
+    run = Path(out or Path(config["paths"]["output"]) / "deepsdf" / folder.resolve().name)
     if (run / "config.yaml").exists():
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
     specs = read_specs(folder / "specs.json")
     codes = read_codes(folder / "LatentCodes" / f"{epoch}.pth", specs.CodeLength)
-    parameters = folder / "ModelParameters" / f"{epoch}.pth"
-    node = decoder_node(specs, folder / "specs.json")
-    weights = decoder_weights(_read(parameters, "model_state_dict"), specs, node, parameters)
-    saved_decoder(node, weights, parameters)  # or says what does not fit
+    file = folder / "ModelParameters" / f"{epoch}.pth"
+    node = decoder_node(specs)
+    weights = decoder_weights(_read(file, "model_state_dict"), specs, node, file)
+    saved_decoder(node, weights, file)  # or says what does not fit
     names = shape_names(folder, specs, split, len(codes))
     source = config["data"]["source"]
     ids = [shape_id(name, by_synset(source["categories"])) for name in names]
     frames = known_frames(Path(source["root"]), dict(zip(ids, names, strict=True)))
-    config = {key: value for key, value in config.items() if key not in OWN_KEYS} | {"decoder": node}
-    config["codes"] |= {"max_norm": specs.CodeBound}
+    for key in OWN_KEYS:
+        del config[key]
+    config["decoder"] = node
+    config["codes"]["max_norm"] = specs.CodeBound
     config["loss"] |= {"delta": specs.ClampingDistance, "lambda_code": specs.CodeRegularizationLambda}
     begin_run(run, config, ids, [], frames, DeepSdfSource.up)
     shutil.copyfile(folder / "specs.json", run / "specs.json")
     state = {f"decoder.{name}": weight for name, weight in weights.items()} | {"codes.table": codes}
-    parameters = {"decoder": node, "shapes": len(codes), "seed": config["seed"]}
-    parameters |= {name: config[name] for name in ("codes", "loss", "optim", "computing")}
-    write_checkpoint({"state_dict": state, "hyper_parameters": parameters}, run / "checkpoints" / LAST)
+    about = {name: config[name] for name in ("decoder", "codes", "loss", "optim", "computing", "seed")}
+    about["shapes"] = len(codes)
+    write_checkpoint({"state_dict": state, "hyper_parameters": about}, run / "checkpoints" / LAST)
     log.info(f"run: {run}: {len(load(run).ids)} shapes, {len(frames)} of them with their source's frame")
-    return run
 
 
 def read_specs(path: Path) -> Specs:
@@ -103,38 +102,31 @@ def read_specs(path: Path) -> Specs:
         SdfhubError: no experiment, or a decoder that ours cannot be; names the setting.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        specs = Specs.model_validate_json(path.read_bytes())
     except OSError as error:
         raise SdfhubError(f"{path}: not an experiment of DeepSDF's ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise SdfhubError(f"{path}: not JSON: {error}") from error
-    try:
-        specs = Specs.model_validate(content)
     except ValidationError as error:
         wrong = error.errors()[0]
-        key = ".".join(map(str, wrong["loc"]))
-        raise SdfhubError(f"{path}: {key}: {wrong['msg'].lower()}") from error
-    network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
+        raise SdfhubError(f"{path}: {'.'.join(map(str, wrong['loc']))}: {wrong['msg'].lower()}") from error
+    network, layers = specs.NetworkSpecs, {*range(len(specs.NetworkSpecs.dims) + 1)}
+    is_layer_norm = not network.weight_norm and not layers.isdisjoint(network.norm_layers or [])
     refusals = {
-        "NetworkArch": specs.NetworkArch != "deep_sdf_decoder" and "only deep_sdf_decoder is known",
-        "dims": len(set(network.dims)) > 1 and "layers of different widths cannot be represented",
-        "use_tanh": network.use_tanh and "a tanh before the last tanh cannot be represented",
-        "norm_layers": not network.weight_norm
-        and bool({*(network.norm_layers or [])} & {*range(depth + 1)})
-        and "LayerNorm (norm_layers without weight_norm) cannot be represented",
+        "NetworkArch: only deep_sdf_decoder is known": specs.NetworkArch != "deep_sdf_decoder",
+        "dims: layers of different widths cannot be represented": len(set(network.dims)) > 1,
+        "use_tanh: a tanh before the last tanh cannot be represented": network.use_tanh,
+        "norm_layers: LayerNorm (norm_layers without weight_norm) cannot be represented": is_layer_norm,
+        f"latent_in: must name layers 1 to {len(network.dims)}": not {*network.latent_in} <= layers - {0},
     }
-    for key, refusal in refusals.items():
-        if refusal:
-            raise SdfhubError(f"{path}: {key}: {refusal}")
+    for refusal, is_due in refusals.items():
+        if is_due:
+            raise SdfhubError(f"{path}: {refusal}")
     return specs
 
 
-def decoder_node(specs: Specs, path: Path) -> dict[str, Any]:
+def decoder_node(specs: Specs) -> dict[str, Any]:
     """DeepSDF's decoder as a node of our config."""
     network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
     hidden = set(range(depth))
-    if not set(network.latent_in) <= set(range(1, depth + 1)):
-        raise SdfhubError(f"{path}: latent_in={network.latent_in}: names layers 1 to {depth}")
     return {
         "_target_": "sdfhub.model.decoder.Decoder",
         "encoding": {"_target_": "sdfhub.model.encodings.Identity"},
@@ -154,39 +146,33 @@ def decoder_node(specs: Specs, path: Path) -> dict[str, Any]:
 def decoder_weights(
     parameters: Mapping[str, Tensor], specs: Specs, node: Mapping[str, Any], path: Path
 ) -> dict[str, Tensor]:
-    """DeepSDF's parameters under the names and in the column order of our decoder.
+    """DeepSDF's parameters, from `path`, under the names and in the column order of our decoder, `node`.
 
     A layer's weight norm is kept where all hidden layers have one, else multiplied out.
-
-    Args:
-        parameters: of its decoder, by name.
-        specs: what they belong to.
-        node: our decoder's config.
-        path: whose they are, for messages.
     """
-    left = {name.removeprefix("module."): tensor for name, tensor in parameters.items()}
-    found = {}
+    left = {name.removeprefix("module."): tensor.clone() for name, tensor in parameters.items()}
+    weights = {}
     try:
         for index in range(node["depth"] + 1):
             theirs, ours = f"lin{index}", f"layers.{index}.linear"
-            reads_code = index == 0 or index in node["inject_code"]
-            found[f"{ours}.bias"] = left.pop(f"{theirs}.bias")
-            is_normed = f"{theirs}.weight_g" in left
-            weight = left.pop(f"{theirs}.weight_v" if is_normed else f"{theirs}.weight")
-            weight = _reordered(weight, specs.CodeLength) if reads_code else weight
-            length = left.pop(f"{theirs}.weight_g") if is_normed else None
-            if is_normed and node["weight_norm"] and index < node["depth"]:
-                found[f"{ours}.parametrizations.weight.original0"] = length
-                found[f"{ours}.parametrizations.weight.original1"] = weight
-            else:
+            weights[f"{ours}.bias"] = left.pop(f"{theirs}.bias")
+            length = left.pop(f"{theirs}.weight_g", None)
+            weight = left.pop(f"{theirs}.weight" if length is None else f"{theirs}.weight_v")
+            if index == 0 or index in node["inject_code"]:
+                weight = _reordered(weight, specs.CodeLength)
+            if length is not None and node["weight_norm"] and index < node["depth"]:
+                weights[f"{ours}.parametrizations.weight.original0"] = length
+                weights[f"{ours}.parametrizations.weight.original1"] = weight
+                continue
+            if length is not None:
                 precise = weight.double()
-                whole = precise * (length / precise.norm(dim=1, keepdim=True)) if is_normed else precise
-                found[f"{ours}.weight"] = whole.float()
+                weight = (precise * (length / precise.norm(dim=1, keepdim=True))).float()
+            weights[f"{ours}.weight"] = weight
     except KeyError as error:
         raise SdfhubError(f"{path}: lacks {error}, which specs.json describes") from error
     if left:
         raise SdfhubError(f"{path}: has {min(left)}, which specs.json does not describe")
-    return {name: tensor.clone() for name, tensor in found.items()}
+    return weights
 
 
 def _reordered(weight: Tensor, code_size: int) -> Tensor:
@@ -218,11 +204,8 @@ def _read(path: Path, key: str) -> Any:
 def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> list[str]:
     """Names of the shapes in the order of their codes: paths below its data's folder, or numbers.
 
-    Args:
-        folder: of the experiment; `TrainSplit` is relative to it or to a folder above, or to the present one.
-        specs: names the split file.
-        split: names another; must be there.
-        count: of codes.
+    `TrainSplit` is relative to the experiment's folder, to one above it, or to the present one; `split`,
+    where given, stands in for it.
 
     Raises:
         SdfhubError: the file lists another number of shapes.
@@ -232,7 +215,7 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
     file = next((place for place in places if place.is_file()), Path(split) if split else None)
     if file is None:
         log.warning(
-            f"{folder}: TrainSplit {specs.TrainSplit} is not here: shapes are numbered; or give split="
+            "%s: TrainSplit %s is not here: shapes are numbered; or give split=", folder, specs.TrainSplit
         )
         return [f"shape/{row:05d}" for row in range(count)]
     names = list(names_listed(str(file), "train"))
@@ -245,10 +228,5 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
 def known_frames(root: Path, name_of: Mapping[str, str]) -> dict[str, Frame]:
     """Frames of shapes, as far as DeepSDF's data lies at `root`."""
     samples = root if root.name == "SdfSamples" else root / "SdfSamples"
-    found = {id: frame_of(samples / f"{name}.npz") for id, name in name_of.items()}
-    return {id: Frame(*frame) for id, frame in found.items() if frame}
-
-
-def main() -> None:
-    """Console entry: `sdfhub import-deepsdf EXPERIMENT_DIR`."""
-    run_task(lambda config: import_deepsdf(config) and None, "import_deepsdf", ["folder"])
+    frames = {id: frame_of(samples / f"{name}.npz") for id, name in name_of.items()}
+    return {id: frame for id, frame in frames.items() if frame}

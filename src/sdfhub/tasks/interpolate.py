@@ -3,7 +3,6 @@
 from omegaconf import DictConfig
 
 from sdfhub.opening import beside, load
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.gallery import write_gallery
 
 
@@ -17,8 +16,3 @@ def interpolate(config: DictConfig) -> None:
     name = "interpolate/" + "_to_".join(end.replace("/", "-") for end in ends)
     folder = beside(config.run, config.out, name)
     write_gallery(space, codes, captions, folder, config.resolution, animated=True)
-
-
-def main() -> None:
-    """Console entry: `sdfhub interpolate RUN A B steps=8`."""
-    run_task(interpolate, "interpolate", ["run", "a", "b"])

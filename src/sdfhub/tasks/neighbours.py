@@ -7,7 +7,6 @@ from omegaconf import DictConfig
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import beside, load
 from sdfhub.scans.scan import read_scan
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.gallery import write_gallery
 
 
@@ -28,8 +27,3 @@ def neighbours(config: DictConfig) -> None:
     codes = space.code([shape, *(id for id, _ in nearest)])
     folder = beside(config.run, config.out, f"neighbours/{name.replace('/', '-')}")
     write_gallery(space, codes, captions, folder, config.resolution)
-
-
-def main() -> None:
-    """Console entry: `sdfhub neighbours RUN OF k=7`."""
-    run_task(neighbours, "neighbours", ["run", "of"])

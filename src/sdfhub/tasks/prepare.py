@@ -7,7 +7,6 @@ from omegaconf import DictConfig
 
 from sdfhub.composition import instantiate
 from sdfhub.errors import SdfhubError
-from sdfhub.tasks.app import run_task
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +27,3 @@ def prepare(config: DictConfig) -> None:
         raise SdfhubError(f"part={config.part}: must be i/n with 1 <= i <= n, as in -m part=1/4,2/4,3/4,4/4")
     shapes, made = data.prepare_part(i, n)
     log.info("part %s: %d shapes, %d of them prepared now", config.part, shapes, made)
-
-
-def main() -> None:
-    """Console entry: `sdfhub prepare data=open category=chairs data.shapes=null`."""
-    run_task(prepare, "prepare")

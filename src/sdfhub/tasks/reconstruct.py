@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from omegaconf import DictConfig
 from pydantic import Field
@@ -26,7 +26,6 @@ from sdfhub.scans.scan import FORMATS
 from sdfhub.scans.simulated import ScanKind
 from sdfhub.shapes import NORMALIZED
 from sdfhub.space import Space
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
@@ -72,7 +71,7 @@ def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]
     return reconstructor, instantiate(config.calibration, "calibration")
 
 
-def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
+def scan_frame(space: Space, frame: Any, of: str | int | None) -> ScanFrame:
     """Where scans lie.
 
     Args:
@@ -83,8 +82,10 @@ def scan_frame(space: Space, frame: str, of: str | int | None) -> ScanFrame:
     check(frame, Literal["shape", "normalised", "source", "unknown"], "frame")
     if of is not None and frame != "source":
         raise SdfhubError(f"of={of}: needs frame=source")
-    if frame != "source":
-        return NORMALIZED if frame == "normalised" else frame
+    if frame == "normalised":
+        return NORMALIZED
+    if frame in ("shape", "unknown"):
+        return frame
     if of is not None:
         id = space.ids[space.row(of)]
         if id not in space.frames:
@@ -113,7 +114,7 @@ def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape
     rest = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
     rest = [shape for shape in rest if shape.split == "held_out"] or rest
     more = split(rest, 0, min(count - len(first), len(rest)), seed=0).held_out
-    return list(data.filled(Split([], first + more)))
+    return list(data.filled(Split([], first + more)).values())
 
 
 def limits_of(
@@ -126,7 +127,7 @@ def limits_of(
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     if not calibration.shapes:
         return {}
-    settings = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
+    settings: dict[str, Any] = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
     settings["poses"] = plain(config.poses) if reconstructor.poses else None
     try:
         return calibration.limits(
@@ -184,8 +185,3 @@ def reconstruct(config: DictConfig) -> None:
     """The task: `config` as conf/reconstruct.yaml has it."""
     if any(result.verdict == "failed" for result in reconstruct_run(config)):
         sys.exit(1)
-
-
-def main() -> None:
-    """Console entry: `sdfhub reconstruct RUN SCAN ...`. Exit status 1 if a scan failed."""
-    run_task(reconstruct, "reconstruct", ["run", "scans..."])

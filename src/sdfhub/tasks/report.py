@@ -24,7 +24,6 @@ from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
-from sdfhub.tasks.app import run_task
 from sdfhub.whole_file import refuse_unwritable, write_whole
 
 log = logging.getLogger(__name__)
@@ -112,7 +111,7 @@ def truth_finder() -> FindTruth:
         if key not in stores:
             stores[key] = _store(config)
         store = stores[key]
-        return store[id] if store and id in store else None
+        return store.get(id) if store else None
 
     return find
 
@@ -120,12 +119,10 @@ def truth_finder() -> FindTruth:
 def _store(config: dict[str, Any]) -> Store | None:
     try:
         data = data_of(config)
-        store = Store.open(Path(data.store) / data.source.name / preparation_hash(data.preparation))
+        folder = Path(data.store) / data.source.name / preparation_hash(data.preparation)
+        return Store.open(folder, up=data.source.up)
     except (SdfhubError, KeyError, TypeError, AttributeError):
         return None  # not on this machine: a report without ground truth
-    for shape in store:
-        shape.up = data.source.up
-    return store
 
 
 def report(config: DictConfig) -> None:
@@ -139,8 +136,3 @@ def report(config: DictConfig) -> None:
     cells = write_report(sweep, folder, config.shapes)
     if failed := sum(cell.state == "failed" for cell in cells):
         log.warning("%d of %d cells failed; the command of the sweep tries them again", failed, len(cells))
-
-
-def main() -> None:
-    """Console entry: `sdfhub report SWEEP_DIR [out=... shapes=...]`."""
-    run_task(report, "report", ["sweep"])

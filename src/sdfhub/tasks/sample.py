@@ -3,7 +3,6 @@
 from omegaconf import DictConfig
 
 from sdfhub.opening import beside, load
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.gallery import write_gallery
 
 
@@ -17,8 +16,3 @@ def sample(config: DictConfig) -> None:
     captions = [f"new\nnearest {id}" for id, _ in nearest]
     folder = beside(config.run, config.out, f"sample/seed_{config.seed}")
     write_gallery(space, codes, captions, folder, config.resolution)
-
-
-def main() -> None:
-    """Console entry: `sdfhub sample RUN n=8`."""
-    run_task(sample, "sample", ["run"])

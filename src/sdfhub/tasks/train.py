@@ -5,7 +5,7 @@ import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import hydra
 import torch
@@ -34,8 +34,6 @@ from sdfhub.multirun.processes import ending_together, refuse_processes_in_multi
 from sdfhub.multirun.search import objective
 from sdfhub.opening import begin_run
 from sdfhub.settings import flat
-from sdfhub.shapes import Frame
-from sdfhub.tasks.app import run_task
 from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
 
 log = logging.getLogger(__name__)
@@ -69,7 +67,7 @@ class Parts:
     evaluation: Evaluation
 
 
-def train(config: DictConfig, folder: Path) -> dict[str, Any]:
+def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Trains what a composed config describes into a folder.
 
     Returns:
@@ -92,7 +90,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
         written | {"data": with_absolute_paths(written["data"])},
         train=ids,
         held_out=[shape.id for shape in parts.data.held_out_shapes],
-        frames={shape.id: Frame(shape.center, shape.scale) for shape in parts.data.train_shapes},
+        frames={shape.id: shape.frame for shape in parts.data.train_shapes},
         up=parts.data.train_shapes[0].up,
     )
     log.info("run: %s", folder)
@@ -100,7 +98,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, Any]:
     fit(model, parts, config.ckpt_path)
     if not parts.trainer.is_global_zero:
         return {}
-    if parts.trainer.fast_dev_run:
+    if getattr(parts.trainer, "fast_dev_run", False):
         log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
         return {}
     checkpoint = folder / "checkpoints" / LAST
@@ -128,7 +126,6 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
     trainer = make_trainer(config.trainer, folder, callbacks, loggers)
-    model["computing"].refuse_impossible(model["decoder"].encoding, trainer.strategy.root_device)
     return Parts(
         data=instantiate(config.data, "data"),
         model=partial(AutoDecoder, **model, seed=config.seed),
@@ -147,15 +144,16 @@ def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
     parts = []
     for name, node in (config or {}).items():
         if node is not None:
-            parts.append(instantiate(node, f"{group}.{name}"))
+            parts.append(instantiate(node, f"{group}.{name!s}"))
             if not isinstance(parts[-1], kind):
-                raise SdfhubError(f"{group}.{name}: is no Lightning {kind.__name__}; give it a _target_")
+                raise SdfhubError(f"{group}.{name!s}: is no Lightning {kind.__name__}; give it a _target_")
     return parts
 
 
 def make_optimisation(config: DictConfig) -> Optimisation:
     """What `optim` describes; its `_target_` may be an optimiser of PyTorch, in the place of Adam."""
-    if issubclass(located(config._target_, "optim"), torch.optim.Optimizer):
+    target: Any = located(config._target_, "optim")
+    if issubclass(target, torch.optim.Optimizer):
         return Optimisation.of(hydra.utils.instantiate(config, _convert_="all", _partial_=True))
     return Optimisation.of(instantiate(config, "optim"))
 
@@ -176,22 +174,17 @@ def make_trainer(
         )
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
-    ours = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
-    ours |= {
-        "plugins": [WholeFileIO()],
-        "enable_checkpointing": any(isinstance(c, Checkpoint) for c in callbacks),
-    }
+    ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
+    ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
+    ours["plugins"] = [WholeFileIO()]
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     trainer = instantiate(config, "trainer", **given)
-    for name in (
-        "lightning",
-        "lightning.pytorch",
-        "lightning.fabric",
-    ):  # through our handlers, into train.log
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
-    for name in ("lightning.pytorch", "lightning.fabric"):  # what hardware there is not, and advertisements
-        logging.getLogger(f"{name}.utilities.rank_zero").setLevel(logging.WARNING)
+    # what hardware there is not, advertisements, defaults of Lightning's own files
+    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     return trainer
 
 
@@ -247,17 +240,12 @@ def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]
         logger.save()
 
 
-def run(config: DictConfig) -> float | None:
+def train(config: DictConfig) -> float | None:
     """One run, or one cell of a multirun, of a composed config with Hydra's own part set."""
     hydra = HydraConfig.get()
     if config.print_config:
         log.info(OmegaConf.to_yaml(config))
     if hydra.mode == RunMode.MULTIRUN:
-        return objective(run_cell(train, config, hydra))
-    go_on(train, config, Path(hydra.runtime.output_dir))
+        return objective(run_cell(train_into, config, cast(DictConfig, hydra)))
+    go_on(train_into, config, Path(hydra.runtime.output_dir))
     return None
-
-
-def main() -> None:
-    """Console entry: `python train.py activation=hosc encoding=fourier`."""
-    run_task(run, "config")

@@ -10,7 +10,6 @@ from pydantic import Field
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import load
-from sdfhub.tasks.app import run_task
 
 
 def view(config: DictConfig) -> None:
@@ -29,8 +28,3 @@ def view(config: DictConfig) -> None:
         threading.Event().wait()
     finally:
         viewer.close()
-
-
-def main() -> None:
-    """Console entry: `sdfhub view RUN`."""
-    run_task(view, "view", ["run"])

@@ -24,7 +24,8 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     """
     given = {word.partition("=")[0] for word in argv if not is_positional(word)}
     left = [name for name in names if name.removesuffix("...") not in given]
-    overrides, many = [], []
+    overrides: list[str] = []
+    many: list[str] = []
     is_value = False
     for word in argv:
         if is_value or not is_positional(word) or not left:

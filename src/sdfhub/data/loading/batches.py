@@ -1,14 +1,16 @@
 """Streams per-shape samples as training batches: step number in, batch out, nothing remembered.
 
 A batch is a function of (seed, step), so that a resumed run sees what an uninterrupted one would, with any
-number of loader workers. Shards are pre-shuffled, so a random draw is one contiguous, wrapping slice.
+number of loader workers. Stored rows are shuffled, so a random draw is one contiguous, wrapping slice.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic.dataclasses import dataclass
 from torch.utils.data import Dataset
 
 from sdfhub.data.store.stored_shape import StoredShape
@@ -21,22 +23,12 @@ class Augmentation:
     """Extra training shapes: seeded similar copies of the real ones, each with a code of its own.
 
     The paper names data augmentation and does not describe it. Reflection and uniform scaling are the
-    transforms under which a signed distance stays exact (d becomes scale * d), so these it is; the code
-    table grows by a factor 1 + copies.
-
-    Args:
-        copies: transformed copies of each shape, >= 0; 0 switches augmentation off.
-        mirror: whether odd copies are reflected in the plane x = 0.
-        smallest: lower end of the uniform distribution, up to 1, of a copy's scale, in (0, 1].
+    transforms under which a signed distance stays exact (d becomes scale * d).
     """
 
-    copies: int = 0
-    mirror: bool = True
-    smallest: float = 0.8
-
-    def __post_init__(self):
-        if self.copies < 0 or not 0 < self.smallest <= 1:
-            raise ValueError("copies must not be negative and smallest in (0, 1]")
+    copies: NonNegativeInt = 0  # of each shape
+    mirror: bool = True  # odd copies in the plane x = 0
+    smallest: Annotated[float, Field(gt=0, le=1)] = 0.8  # scales are uniform from here to 1
 
     def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
         """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
@@ -44,40 +36,21 @@ class Augmentation:
             return np.ones(3, np.float32), np.float32(1)
         scale = np.float32(np.random.default_rng((seed, row)).uniform(self.smallest, 1))
         flip = -1 if self.mirror and copy % 2 else 1
-        return np.float32([flip, 1, 1]) * scale, scale
+        return np.array([flip, 1, 1], np.float32) * scale, scale
 
 
 @dataclass(frozen=True)
 class Loading:
-    """How much of which shapes a training step sees.
+    """How much of which shapes a training step sees."""
 
-    Args:
-        shapes_per_step: B, >= 1.
-        samples_per_shape: N, half outside, half inside, >= 2.
-        surface_per_shape: M oriented surface points a step and shape; 0 without normals.
-        passes_per_epoch: how often an epoch visits every shape; more than 1 keeps epochs of a few shapes
-            from being shorter than their overhead.
-        workers: loader processes; 0 draws in the training process.
-        resident: whether all samples lie in the memory of the device that trains; None: where that is a GPU.
-        augmentation: extra shapes.
-        seed: of every draw.
-    """
-
-    shapes_per_step: int = 20
-    samples_per_shape: int = 512
-    surface_per_shape: int = 0
-    passes_per_epoch: int = 1
-    workers: int = 0
+    shapes_per_step: PositiveInt = 20  # B
+    samples_per_shape: Annotated[int, Field(ge=2)] = 512  # N, half outside, half inside
+    surface_per_shape: NonNegativeInt = 0  # M oriented surface points a step and shape; 0 without normals
+    passes_per_epoch: PositiveInt = 1  # visits to every shape: few shapes make epochs too short otherwise
+    workers: NonNegativeInt = 0  # loader processes; 0 draws in the training process
     augmentation: Augmentation = Augmentation()
-    seed: int = 0
-    resident: bool | None = None
-
-    def __post_init__(self):
-        least = {"shapes_per_step": 1, "samples_per_shape": 2, "surface_per_shape": 0}
-        least |= {"passes_per_epoch": 1, "workers": 0, "seed": 0}
-        for name, bound in least.items():
-            if getattr(self, name) < bound:
-                raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+    seed: NonNegativeInt = 0  # of every draw
+    resident: bool | None = None  # all samples in the memory of the device; None: where that is a GPU
 
 
 class StepBatches(Dataset):
@@ -109,11 +82,18 @@ class StepBatches(Dataset):
         return self.steps_per_pass * self.loading.passes_per_epoch
 
     def __getitem__(self, step: int) -> Batch:
-        rows = self.rows_of(step)
-        samples = np.empty((len(rows), self.loading.samples_per_shape, 4), np.float32)
-        surface = np.empty((len(rows), self.loading.surface_per_shape, 6), np.float32)
-        for row, *of_shape in zip(rows, samples, surface, strict=True):
-            self._draw(int(row), self.generator(step, row), *of_shape)
+        rows, loading = self.rows_of(step), self.loading
+        samples = np.empty((len(rows), loading.samples_per_shape, 4), np.float32)
+        surface = np.empty((len(rows), loading.surface_per_shape, 6), np.float32)
+        for row, points, oriented in zip(rows, samples, surface, strict=True):
+            copy, index = divmod(int(row), len(self.shapes))
+            rng = self.generator(step, row)
+            draw_signed(points, self.shapes[index], rng)
+            draw_rows(oriented, self.shapes[index], "surface", rng)
+            if copy:
+                axes, scale = loading.augmentation.transform(copy, int(row), loading.seed)
+                points *= np.append(axes, scale)
+                oriented *= np.concatenate([axes, np.sign(axes)])
         return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
 
     def rows_of(self, step: int) -> np.ndarray:
@@ -127,17 +107,6 @@ class StepBatches(Dataset):
     def generator(self, step: int, row: int) -> np.random.Generator:
         """What draws the samples of one row at one step."""
         return np.random.default_rng((self.loading.seed, 2, step, row))
-
-    def _draw(self, row: int, rng: np.random.Generator, samples: np.ndarray, surface: np.ndarray) -> None:
-        """Fills samples [N, 4] and oriented surface points [M, 6] of one row of the code table."""
-        copy, index = divmod(row, len(self.shapes))
-        shape = self.shapes[index]
-        axes, scale = self.loading.augmentation.transform(copy, row, self.loading.seed)
-        draw_signed(samples, shape, rng)
-        draw_rows(surface, shape, "surface", rng)
-        if copy:
-            samples *= np.append(axes, scale)
-            surface *= np.concatenate([axes, np.sign(axes)])
 
 
 def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
@@ -159,18 +128,14 @@ def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) 
     draw_rows(rows[outside:], shape, "inside", rng)
 
 
-def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
-    """Refuses to draw rows of an array that has none.
-
-    Raises:
-        SdfhubError: names the shape and the array.
-    """
-    if count and not shape.rows(name):
-        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
-
-
 def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
-    """Fills rows [n, C], contiguous, with consecutive ones of a pre-shuffled array from a random start."""
+    """Fills rows [n, C], contiguous, with consecutive ones of a shuffled array from a random start."""
     refuse_empty(shape, name, len(rows))
     if len(rows):
         shape.read_into(rows, name, int(rng.integers(shape.rows(name))))
+
+
+def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
+    """Raises SdfhubError where rows are to be drawn of an array that has none."""
+    if count and not shape.rows(name):
+        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")

@@ -3,10 +3,12 @@
 import logging
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import lightning as L
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from torch.utils.data import DataLoader, Sampler
 
 from sdfhub.data.loading.batches import Loading, StepBatches
@@ -23,13 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class ValidationShape(NamedTuple):
-    """One shape to be scored while training.
-
-    Args:
-        role: whether it is trained on.
-        row: of the code table; None where it is held out.
-        shape: its samples and mesh.
-    """
+    """One shape to be scored while training: its role, its row of the code table where it has one, itself."""
 
     role: Literal["train", "held_out"]
     row: int | None
@@ -40,11 +36,7 @@ class EpochSteps(Sampler[int]):
     """The step numbers of one epoch, from the first that has not been done.
 
     Lightning ends an epoch by itself, also one that a checkpoint of its middle resumes. Its own `set_epoch`
-    comes too early after a resume: it starts again at epoch 0.
-
-    Args:
-        steps: steps of an epoch.
-        done: gives how many steps have been done, also after a resume; None counts them here.
+    comes too early after a resume. `done` gives the steps done so far, also then; None counts them here.
     """
 
     def __init__(self, steps: int, done: Callable[[], int] | None = None):
@@ -65,41 +57,23 @@ class SdfDataModule(L.LightningDataModule):
     Batches derive from (seed, step): a resumed training sees what an undisturbed one would. In a
     distributed training give the trainer `use_distributed_sampler=False`; each batch is shared here.
 
-    Args:
-        source: where shapes come from.
-        store: folder of prepared samples, shared by all runs.
-        workers: processes that prepare shapes, >= 1; None: one per core.
-        shapes: how many to train on, >= 1; None takes all that are not held out. For a source such as a
-            folder, which has what it has, an upper bound.
-        held_out: how many are never trained on, >= 0; see `splits.split`.
-        split_seed: draws both.
-        preparation: how meshes become samples.
-        loader: what a training step sees.
-        validation_shapes: shapes of each role that `val_dataloader` yields, >= 0.
-
     Attributes:
-        train_shapes: prepared shapes in the order of the code table, after `setup`.
-        held_out_shapes: prepared shapes, after `setup`.
+        train_shapes, held_out_shapes: prepared, in the order of the code table, after `setup`.
     """
 
     def __init__(
         self,
         source: Source,
-        store: str = "data/store",
-        workers: int | None = None,
-        shapes: int | None = None,
-        held_out: int = 4,
-        split_seed: int = 0,
+        store: str = "data/store",  # folder of prepared samples, shared by all runs
+        workers: PositiveInt | None = None,  # processes that prepare shapes; None: one per core
+        shapes: PositiveInt | None = None,  # to train on; None: all not held out; of a folder at most so many
+        held_out: NonNegativeInt = 4,  # never trained on; see `splits.split`
+        split_seed: NonNegativeInt = 0,  # draws both
         preparation: Preparation = DEFAULT,
         loader: Loading = Loading(),  # noqa: B008 - frozen
-        validation_shapes: int = 2,
+        validation_shapes: NonNegativeInt = 2,  # of each role, in `val_dataloader`
     ):
         super().__init__()
-        numbers = {"workers": (workers, 1), "shapes": (shapes, 1), "held_out": (held_out, 0)}
-        numbers |= {"split_seed": (split_seed, 0), "validation_shapes": (validation_shapes, 0)}
-        for name, (number, least) in numbers.items():
-            if number is not None and number < least:
-                raise SdfhubError(f"data.{name}={number}: must be at least {least}")
         self.source, self.store, self.workers = source, store, workers
         self.shapes, self.held_out, self.split_seed = shapes, held_out, split_seed
         self.preparation, self.loader, self.validation_shapes = preparation, loader, validation_shapes
@@ -114,7 +88,7 @@ class SdfDataModule(L.LightningDataModule):
         roles = split(offered, self.shapes, self.held_out, self.split_seed, self.source.is_collection)
         train, held_out = len(roles.train), len(roles.held_out)
         left_out = len(offered) - train - held_out
-        if self.source.is_collection and (left_out or train != self.shapes or held_out != self.held_out):
+        if self.source.is_collection and (left_out or (train, held_out) != (self.shapes, self.held_out)):
             asked = f"data.shapes={'null' if self.shapes is None else self.shapes}"
             log.info(
                 f"data: {self.source.label}: of {_counted(len(offered))} {train} are trained on, {held_out} "
@@ -125,29 +99,25 @@ class SdfDataModule(L.LightningDataModule):
     def prepared(self, roles: Split) -> tuple[list[StoredShape], list[StoredShape]]:
         """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
         store = self.filled(roles)
-        train, held_out = (
-            [store[s.id] for s in part if s.id in store] for part in (roles.train, roles.held_out)
-        )
-        asked = len(roles.train) + len(roles.held_out)
-        rejected = f" ({_counted(asked)} asked for, {len(store.rejected)} rejected)" if store.rejected else ""
-        name = self.source.name
-        log.info(f"data: {name}: {_counted(len(train))} to train on, {len(held_out)} held out{rejected}")
+        train, held_out = ([store[s.id] for s in part if s.id in store] for part in roles)
+        asked = _counted(len(roles.train + roles.held_out))
+        rejected = f" ({asked} asked for, {len(store.rejected)} rejected)" if store.rejected else ""
+        what = f"{_counted(len(train))} to train on, {len(held_out)} held out{rejected}"
+        log.info(f"data: {self.source.name}: {what}")
         log.info(f"store: {store.folder}: {store.summary()}")
         return train, held_out
 
     def filled(self, roles: Split) -> Store:
         """The store with the shapes of both roles."""
         shapes = roles.train + roles.held_out
-        return stores.prepare(self.source, shapes, self.preparation, self.store, self.workers)
+        return stores.prepare(self.source, shapes, self.preparation, Path(self.store), self.workers)
 
     def prepare_part(self, part: int, parts: int) -> tuple[int, int]:
-        """Prepares one of so many parts of the shapes, 1 <= part <= parts; processes may share the work so.
-
-        Returns:
-            Shapes of the part, and how many of them were prepared now.
-        """
+        """Prepares part 1 <= `part` <= `parts` of the shapes; returns its shapes, and those prepared now."""
         own = (self.split.train + self.split.held_out)[part - 1 :: parts]
-        return len(own), stores.prepare_part(self.source, own, self.preparation, self.store, self.workers)
+        return len(own), stores.prepare_part(
+            self.source, own, self.preparation, Path(self.store), self.workers
+        )
 
     def prepare_data(self) -> None:
         """Fills the store; a second call does nothing.
@@ -162,9 +132,8 @@ class SdfDataModule(L.LightningDataModule):
         if self._batches is not None:
             return
         if self.loader.surface_per_shape and not self.source.has_normals:
-            raise SdfhubError(
-                f"normals=on: the files of data={self.source.name} carry none; train with normals=off"
-            )
+            name = self.source.name
+            raise SdfhubError(f"normals=on: the files of data={name} carry none; train with normals=off")
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
         if not self.train_shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")
@@ -193,11 +162,13 @@ class SdfDataModule(L.LightningDataModule):
         resident = device.type != "cpu" if self.loader.resident is None else self.loader.resident
         if resident and not isinstance(self.batches, ResidentBatches):
             self._batches = ResidentBatches(self.train_shapes, self.loader, device)
+        done = None
         if trainer:
             self.batches.share(trainer.global_rank, trainer.world_size)
+            done = lambda: trainer.global_step * trainer.accumulate_grad_batches  # noqa: E731
         return DataLoader(
             self.batches,
-            sampler=EpochSteps(self.steps_per_epoch, self._batches_done if trainer else None),
+            sampler=EpochSteps(self.steps_per_epoch, done),
             batch_size=None,
             num_workers=0 if resident else self.loader.workers,
             persistent_workers=False,  # a worker of the last epoch would not hear of the next
@@ -208,14 +179,7 @@ class SdfDataModule(L.LightningDataModule):
         count = self.validation_shapes
         items = [ValidationShape("held_out", None, shape) for shape in self.held_out_shapes[:count]]
         items += [ValidationShape("train", row, s) for row, s in enumerate(self.train_shapes[:count])]
-        return DataLoader(items, batch_size=None, collate_fn=_unchanged)
-
-    def _batches_done(self) -> int:
-        return self.trainer.global_step * self.trainer.accumulate_grad_batches
-
-
-def _unchanged(item: ValidationShape) -> ValidationShape:
-    return item
+        return DataLoader(items, batch_size=None)  # type: ignore[arg-type]
 
 
 def _counted(shapes: int) -> str:

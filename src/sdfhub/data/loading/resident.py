@@ -10,9 +10,9 @@ from sdfhub.data.store.stored_shape import COLUMNS, StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 
+# Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
+# Distances beyond it are cut, far outside of what the clamped loss tells apart.
 EXTENT = {"outside": 1.5, "inside": 1.5, "surface": 1.0}
-"""Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
-Distances beyond it are cut, far outside of what the clamped loss tells apart."""
 
 
 class ResidentBatches(StepBatches):
@@ -29,8 +29,9 @@ class ResidentBatches(StepBatches):
     def __init__(self, shapes: Sequence[StoredShape], loading: Loading, device: torch.device):
         super().__init__(shapes, loading)
         self.device = device
-        self.wanted = {"outside": loading.samples_per_shape - loading.samples_per_shape // 2}
-        self.wanted |= {"inside": loading.samples_per_shape // 2, "surface": loading.surface_per_shape}
+        inside = loading.samples_per_shape // 2
+        self.wanted = {"outside": loading.samples_per_shape - inside, "inside": inside}
+        self.wanted["surface"] = loading.surface_per_shape
         for shape in shapes:
             for name, count in self.wanted.items():
                 refuse_empty(shape, name, count)
@@ -40,15 +41,15 @@ class ResidentBatches(StepBatches):
 
     def _table(self, name: str) -> torch.Tensor:
         """[R, C] int16, the rows of all shapes, one after the other."""
-        rows = int(self.first[name][-1])
-        table = torch.empty((rows, COLUMNS[name]), dtype=torch.int16, device=self.device)
+        first = self.first[name]
+        table = torch.empty((int(first[-1]), COLUMNS[name]), dtype=torch.int16, device=self.device)
         for index, shape in enumerate(self.shapes):
-            array = torch.from_numpy(shape.read(name, 0, self.counts[name][index]))
+            array = torch.from_numpy(shape.read(name, 0, shape.rows(name)))
             if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
                 what = f"has points up to {reach:.3g} from 0 along an axis"
                 raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
             fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
-            table[self.first[name][index] : self.first[name][index + 1]] = fractions.to(self.device)
+            table[first[index] : first[index + 1]] = fractions.to(self.device)
         return table
 
     def __getitem__(self, step: int) -> Batch:
@@ -59,30 +60,28 @@ class ResidentBatches(StepBatches):
             for line, name in enumerate(EXTENT):
                 starts[line, column] = rng.integers(self.counts[name][index]) if self.wanted[name] else 0
         shapes = torch.from_numpy(rows % len(self.shapes))
-        drawn = [
-            self._gathered(name, shapes, torch.from_numpy(start), self.wanted[name])
-            for name, start in zip(EXTENT, starts, strict=True)
-        ]
+        drawn = [self._gathered(name, shapes, start) for name, start in zip(EXTENT, starts, strict=True)]
         samples, surface = torch.cat(drawn[:2], dim=1), drawn[2]
         if self.loading.augmentation.copies:
             samples, surface = self._transformed(rows, samples, surface)
         return batch_of(torch.from_numpy(rows).to(self.device), samples, surface)
 
-    def _gathered(self, name: str, shapes: torch.Tensor, start: torch.Tensor, count: int) -> torch.Tensor:
-        """[B, count, C] consecutive rows, wrapping within each shape, as float32."""
-        first, rows = (
-            torch.as_tensor(kept[name])[shapes].to(self.device) for kept in (self.first, self.counts)
-        )
-        steps = torch.arange(count, device=self.device)
-        index = first[:, None] + (start.to(self.device)[:, None] + steps) % rows[:, None].clamp(min=1)
+    def _gathered(self, name: str, shapes: torch.Tensor, start: np.ndarray) -> torch.Tensor:
+        """[B, n, C] consecutive rows, wrapping within each shape, as float32."""
+        kept = self.first[name], self.counts[name]
+        first, rows = (torch.as_tensor(numbers)[shapes].to(self.device) for numbers in kept)
+        steps = torch.arange(self.wanted[name], device=self.device)
+        begin = torch.from_numpy(start).to(self.device)[:, None]
+        index = first[:, None] + (begin + steps) % rows[:, None].clamp(min=1)
         return self.tables[name][index] * (EXTENT[name] / 32767)
 
     def _transformed(
         self, rows: np.ndarray, samples: torch.Tensor, surface: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        augmentation, count = self.loading.augmentation, len(self.shapes)
-        each = [augmentation.transform(row // count, int(row), self.loading.seed) for row in rows]
-        axes = torch.from_numpy(np.stack([axes for axes, _ in each])).to(self.device)
-        scale = torch.from_numpy(np.stack([scale for _, scale in each])).to(self.device)
+    ) -> list[torch.Tensor]:
+        loading, count = self.loading, len(self.shapes)
+        factors = [loading.augmentation.transform(row // count, int(row), loading.seed) for row in rows]
+        axes, scale = (
+            torch.from_numpy(np.stack(part)).to(self.device) for part in zip(*factors, strict=True)
+        )
         samples = samples * torch.cat([axes, scale[:, None]], dim=1)[:, None]
-        return samples, surface * torch.cat([axes, axes.sign()], dim=1)[:, None]
+        return [samples, surface * torch.cat([axes, axes.sign()], dim=1)[:, None]]

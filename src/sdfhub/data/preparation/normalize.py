@@ -7,8 +7,7 @@ from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import Frame, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-ZERO_AREA = 1e-15
-"""Area, normalised units squared, up to which a triangle counts as a line: rounding may leave so much."""
+ZERO_AREA = 1e-15  # of a line, normalised units squared: rounding may leave so much
 
 
 def normalize_mesh(
@@ -23,6 +22,7 @@ def normalize_mesh(
         vertices: [V, 3] numbers, source units.
         faces: [F, 3] integers, rows of `vertices`.
         preparation: `min_faces`, `min_extent_ratio`, `max_zero_area` and `max_components` are used.
+
     Raises:
         RejectedMesh: the arrays make no mesh, or a limit is passed.
     """
@@ -32,12 +32,14 @@ def normalize_mesh(
     used, faces = np.unique(faces, return_inverse=True)
     frame, vertices = _normalized(vertices[used], preparation.min_extent_ratio)
     vertices, faces = _merged(vertices, faces.reshape(-1, 3))
-    faces = _with_area(vertices, faces, preparation.max_zero_area)
-    faces = _without_repeats(faces, len(vertices))
-    count = piece_count(faces, len(vertices))
-    if count > preparation.max_components:
-        limit = preparation.max_components
-        raise RejectedMesh("too_many_components", f"{count} pieces, at most {limit} wanted")
+    filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
+    if (empty := 1 - filled.mean()) > preparation.max_zero_area:
+        what = f"{empty:.1%} of the faces, at most {preparation.max_zero_area:.0%} wanted"
+        raise RejectedMesh("zero_area_faces", what)
+    faces = _without_repeats(faces[filled], len(vertices))
+    if (count := piece_count(faces, len(vertices))) > preparation.max_components:
+        what = f"{count} pieces, at most {preparation.max_components} wanted"
+        raise RejectedMesh("too_many_components", what)
     return NormalizedMesh(vertices, faces, frame)
 
 
@@ -50,16 +52,13 @@ def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
         raise RejectedMesh("no_faces", f"{len(vertices)} vertices and {len(faces)} faces")
     for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
-            raise RejectedMesh(
-                "malformed_arrays", f"{name}: expected [N, 3] numbers, got {list(array.shape)} {array.dtype}"
-            )
+            what = f"{name}: expected [N, 3] numbers, got {list(array.shape)} {array.dtype}"
+            raise RejectedMesh("malformed_arrays", what)
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise RejectedMesh(
-            "face_index_out_of_range", f"{faces.min()} to {faces.max()}, with {len(vertices)} vertices"
-        )
-    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
-    if bad:
+        what = f"{faces.min()} to {faces.max()}, with {len(vertices)} vertices"
+        raise RejectedMesh("face_index_out_of_range", what)
+    if bad := int((~np.isfinite(vertices)).any(axis=1).sum()):
         raise RejectedMesh("non_finite_vertices", f"{bad} of {len(vertices)} vertices are not finite")
     return vertices, faces
 
@@ -90,11 +89,3 @@ def _without_repeats(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     low, middle, high = np.sort(faces, axis=1).T
     pair = np.unique(low * vertex_count + middle, return_inverse=True)[1]  # numbers, faster than rows
     return faces[np.unique(pair * vertex_count + high, return_index=True)[1]]
-
-
-def _with_area(vertices: np.ndarray, faces: np.ndarray, max_zero_area: float) -> np.ndarray:
-    filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
-    empty = 1 - filled.mean()
-    if empty > max_zero_area:
-        raise RejectedMesh("zero_area_faces", f"{empty:.1%} of the faces, at most {max_zero_area:.0%} wanted")
-    return faces[filled]

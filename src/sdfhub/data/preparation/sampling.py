@@ -6,7 +6,7 @@ import numpy as np
 
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, nearest_points
+from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points, pseudo_normal_signs
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
@@ -16,8 +16,7 @@ from sdfhub.shapes import NormalizedMesh, ShapeSamples
 if TYPE_CHECKING:
     import trimesh
 
-PROBES = 2000
-"""Samples on which the fast path must agree with the winding number."""
+PROBES = 2000  # samples on which the fast path must agree with the winding number
 
 
 def prepare_mesh(
@@ -35,32 +34,44 @@ def prepare_mesh(
         mesh: a mesh, or its vertices [V, 3] and faces [F, 3]; source units.
         preparation: what to sample and what to refuse.
         seed: the same seed gives the same samples.
+
     Raises:
         RejectedMesh: no trustworthy signs can be had; its `reason` names the rule.
     """
     try:
-        vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
-    except (TypeError, ValueError) as error:
+        vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
+    except (AttributeError, ValueError) as error:
         what = "a trimesh.Trimesh, as trimesh.load_mesh(file) gives it, or its vertices and faces"
         raise SdfhubError(f"prepare_mesh takes {what}; got {mesh!r:.60}") from error
     normalized = normalize_mesh(vertices, faces, preparation)
     rng = np.random.default_rng(seed)
     surface = closed_surface(normalized) if preparation.sign == "winding" else None
-    signed = surface and _signed_samples(surface, "pseudo_normal", preparation, rng)
-    if not signed or not _winding_agrees(surface, *signed[:2], rng):
+    signed = _signed_samples(surface, pseudo_normal_signs, preparation, rng) if surface else None
+    if not surface or not signed or not _winding_agrees(surface, signed[0], signed[1], rng):
         surface = visible_surface(normalized, preparation, rng)
-        signed = _signed_samples(surface, preparation.sign, preparation, rng)
+        method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
+        signed = _signed_samples(surface, method, preparation, rng)
     points, sdf, statistics = signed
-    _check_signs(statistics, preparation)
-    surface_points, surface_normals = _oriented_points(surface, preparation.surface_points, rng)
+    certain, inside = statistics["certain"], statistics["inside"]
+    low, high = preparation.min_inside, preparation.max_inside
+    if certain < preparation.min_certain:
+        what = f"{certain:.1%} certain, at least {preparation.min_certain:.0%} wanted"
+        raise RejectedMesh("ambiguous_signs", what)
+    if not low <= inside <= high:
+        raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
+    surface_points, normals = np.zeros((0, 3)), np.zeros((0, 3))
+    if count := preparation.surface_points:
+        surface_points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
+        order = rng.permutation(count)
+        surface_points, normals = surface_points[order], normals[order]
     return ShapeSamples(
-        points=points.astype(np.float32),
-        sdf=sdf.astype(np.float32),
-        surface_points=surface_points.astype(np.float32),
-        surface_normals=surface_normals.astype(np.float32),
-        frame=normalized.frame,
-        mesh=NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
-        statistics=statistics,
+        points.astype(np.float32),
+        sdf.astype(np.float32),
+        surface_points.astype(np.float32),
+        normals.astype(np.float32),
+        normalized.frame,
+        NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
+        statistics,
     )
 
 
@@ -77,11 +88,13 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
     return points[morton_order(points)].astype(np.float64)  # the distance is that of the point as stored
 
 
-def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: np.random.Generator):
+def _signed_samples(
+    surface: Surface, sign: SignMethod, preparation: Preparation, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Shuffled points [N, 3], their signed distances [N], and statistics."""
     points = sample_points(surface, preparation, rng)
     nearest = nearest_points(points, surface)
-    signs = SIGN_METHODS[sign](points, nearest, surface, rng)
+    signs = sign(points, nearest, surface, rng)
     statistics = {"fast_path": 0.0, **surface.statistics, "certain": float(signs.certain.mean())}
     statistics |= {"inside": float(signs.inside.mean()), "faces": float(len(surface.faces))}
     sdf = np.where(signs.inside, -nearest.distance, nearest.distance)
@@ -91,26 +104,9 @@ def _signed_samples(surface: Surface, sign: str, preparation: Preparation, rng: 
     return points[order], sdf[order], statistics
 
 
-def _check_signs(statistics: dict[str, float], preparation: Preparation) -> None:
-    certain, inside = statistics["certain"], statistics["inside"]
-    least, low, high = preparation.min_certain, preparation.min_inside, preparation.max_inside
-    if certain < least:
-        raise RejectedMesh("ambiguous_signs", f"{certain:.1%} certain, at least {least:.0%} wanted")
-    if not low <= inside <= high:
-        raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
-
-
 def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> bool:
     """Whether the winding number confirms the pseudo-normal, which self-intersections mislead."""
     order = morton_order(points[:PROBES])
     probes, sdf = points[order], sdf[order]
     inside = SIGN_METHODS["winding"](probes, nearest_points(probes, surface), surface, rng).inside
-    return np.mean(inside != (sdf < 0)) < 0.002
-
-
-def _oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    if not count:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
-    order = rng.permutation(count)
-    return points[order], normals[order]
+    return bool(np.mean(inside != (sdf < 0)) < 0.002)

@@ -11,50 +11,40 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sdfhub.data.preparation.pieces import cut_long
 from sdfhub.data.preparation.visibility import Surface
 from sdfhub.geometry.morton import morton_codes, morton_order
 from sdfhub.geometry.surface_sampling import points_on_faces, random_faces
 from sdfhub.triangles import face_normals
 
-VOTES = 11
-"""Neighbours that vote (DeepSDF's code)."""
-VOTERS = 250_000
-"""Visible points that may vote (DeepSDF's code: half of the samples of a shape)."""
-INNER = 0.95
-"""Part of the radius of an empty ball within which points take the winding number of its centre."""
-CLEAR = 0.1
-"""Distance of a winding number from a whole one below which other points may take it."""
-ROUGH, CLOSE = 1.0, 2.0
-"""Distances, in radii, from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3) and to 0.01."""
-NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1
-"""Edges above which faces are cut before a tree is built over them."""
+VOTES, VOTERS = 11, 250_000  # neighbours that vote, of how many visible points (DeepSDF's code)
+INNER = 0.95  # part of the radius of an empty ball whose points take the winding number of its centre
+CLEAR = 0.1  # distance of a winding number from a whole one below which other points may take it
+ROUGH, CLOSE = 1.0, 2.0  # radii from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3), 0.01
+NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1  # above these faces are cut before a tree is built over them
+ROOM = 50_000  # pieces that cutting may add: it pays where few triangles are long
 
 
 class Nearest(NamedTuple):
-    """Of N points: unsigned distance [N] to the surface, nearest face [N] (a row), nearest point [N, 3]."""
+    """What of a surface is nearest to N points."""
 
-    distance: np.ndarray
-    face: np.ndarray
-    foot: np.ndarray
+    distance: np.ndarray  # [N], unsigned
+    face: np.ndarray  # [N] rows
+    foot: np.ndarray  # [N, 3]
 
 
 class Signs(NamedTuple):
-    """Of N points: whether they lie inside [N], and far enough from a tie to be certain [N]."""
+    """The sides on which N points lie."""
 
-    inside: np.ndarray
-    certain: np.ndarray
+    inside: np.ndarray  # [N]
+    certain: np.ndarray  # [N] far enough from a tie
 
 
 SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs]
+"""Takes points [N, 3], their nearest points of the surface, the surface and a source of chance."""
 
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
-    """Exact unsigned distances to all faces, two-sided sheets included.
-
-    Args:
-        points: [N, 3] float64; fastest in `morton_order`.
-    """
+    """Exact unsigned distances to all faces of points [N, 3] float64; fastest in `morton_order`."""
     vertices, faces, source = cut_long(surface.vertices, surface.faces, NEAREST_EDGE)
     tree = igl.AABB()
     tree.init(vertices, faces)
@@ -67,9 +57,9 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
 
     Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds.
 
-    No face crosses the ball around a point whose radius is its distance, so the sign rarely changes in it.
-    The number is computed for the centres of such balls only, from large cells to small ones, and handed to
-    the other points of the ball when it is clearly a whole one (near a hole it is not).
+    No face crosses the ball around a point whose radius is its distance. The number is computed for the
+    centres of such balls only, from large cells to small ones, and handed to the other points of the ball
+    when it is clearly a whole one (near a hole it is not).
     """
     order = morton_order(points)
     points, distance = points[order], nearest.distance[order]
@@ -148,11 +138,39 @@ def pseudo_normal_signs(
     inside = np.einsum("nj,nj->n", points - foot, normals[nearest.face]) < 0
     edge = share < 1e-6  # elsewhere the face's own normal decides, at no further cost
     if edge.any():
-        signed, *_ = igl.signed_distance(
-            points[edge], surface.vertices, surface.faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        )
-        inside[edge] = signed < 0
+        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        inside[edge] = igl.signed_distance(points[edge], surface.vertices, surface.faces, kind)[0] < 0
     return Signs(inside, np.ones(len(points), bool))
+
+
+def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
+    """Triangles halved across their longest edge until none is longer than `longest`, or ROOM is used up.
+
+    Trees over triangles prune by boxes, and fast winding numbers sum up compact groups: the long thin
+    triangles of a chair's legs make both visit nearly all triangles.
+
+    Returns:
+        vertices [V + M, 3], faces [F + M, 3] that turn as the given ones do, and of each of these the row
+        [F + M] of the face it is a piece of.
+    """
+    source, left = np.arange(len(faces)), np.arange(len(faces))
+    room = ROOM
+    while len(left):
+        corners = vertices[faces[left]]
+        squared = np.sum((np.roll(corners, -1, axis=1) - corners) ** 2, axis=2)
+        long = squared.max(axis=1) > longest**2
+        left, edge = left[long], squared[long].argmax(axis=1)
+        if not 0 < len(left) <= room:
+            break
+        room -= len(left)
+        a, b, c = (faces[left, (edge + i) % 3] for i in range(3))
+        middle = len(vertices) + np.arange(len(left))
+        vertices = np.concatenate([vertices, (vertices[a] + vertices[b]) / 2])
+        first, second = np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
+        faces, source = np.concatenate([faces, second]), np.concatenate([source, source[left]])
+        faces[left] = first
+        left = np.concatenate([left, np.arange(len(faces) - len(left), len(faces))])
+    return vertices, faces, source
 
 
 SIGN_METHODS: dict[str, SignMethod] = {

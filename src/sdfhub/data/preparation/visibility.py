@@ -23,40 +23,26 @@ from sdfhub.triangles import face_normals, piece_count
 # Read by libigl's first call: shapes run in parallel, not points.
 os.environ.setdefault("IGL_NUM_THREADS", "1")
 
-FIRST, SECOND = 16, 48
-"""Rays at every face in the first round, and at undecided ones in the second."""
-RAYS = 1_500_000
-"""Rays of a round above which a face gets fewer than that, down to half."""
-LARGE, AGAIN = 200_000, 3
-"""Rays of the first round on top, shared out by area; a face gets this many times as many in the second."""
-SURE = 0.12
-"""Share of its rays that must reach a face, all on one side, to need no others (an open side has 0.5)."""
-CHUNK = 50_000
-BAD = 0.1
-"""Share of sightings on its less seen side from which a face counts as bad."""
-STEP = 1e-3
-"""Distance from a face at which the winding number before and behind it is taken."""
-SOLID = 0.8
-"""Winding number above which the space behind a face counts as solid."""
-TOUCH = 5e-6
-"""Above a face by which a ray towards the eye starts, so that a coincident face does not stop it."""
+FIRST, SECOND = 16, 48  # rays at every face in the first round, and at undecided ones in the second
+RAYS = 1_500_000  # of a round above which a face gets fewer than that, down to half
+LARGE = 200_000  # rays of the first round on top, shared out by area
+AGAIN = 3  # times as many of these in the second
+SURE = 0.12  # share of its rays that must reach a face, all on one side, to need no others (open: 0.5)
+CHUNK = 50_000  # rays at once
+BAD = 0.1  # share of sightings on its less seen side from which a face counts as bad
+STEP = 1e-3  # distance from a face at which the winding number before and behind it is taken
+SOLID = 0.8  # winding number above which the space behind a face counts as solid
+TOUCH = 5e-6  # above a face: where a ray to the eye starts, so that a coincident face does not stop it
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The faces that bound a shape, oriented outwards.
+    """The faces that bound a shape, oriented outwards, normalised frame."""
 
-    Args:
-        vertices: [V, 3] float64, normalised frame.
-        faces: [F, 3] int64, counter-clockwise seen from outside.
-        two_sided: [F] bool, sheets seen from both sides: a distance, but no inside.
-        statistics: plain numbers about how the faces were found.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    two_sided: np.ndarray
-    statistics: dict[str, float]
+    vertices: np.ndarray  # [V, 3] float64
+    faces: np.ndarray  # [F, 3] int64, counter-clockwise seen from outside
+    two_sided: np.ndarray  # [F] bool, sheets seen from both sides: a distance, but no inside
+    statistics: dict[str, float]  # about how the faces were found
 
     def solid(self) -> np.ndarray:
         """[S, 3] the faces that separate inside from outside."""
@@ -64,26 +50,23 @@ class Surface:
 
 
 class Sightings(NamedTuple):
-    """How much of the faces is seen, as a share of what isolated ones would be from all around.
+    """How much of the faces is seen, as a share of what isolated ones would be from all around."""
 
-    Front is the counter-clockwise side. An unoccluded side reaches about 0.5.
-    """
-
-    front: np.ndarray
-    back: np.ndarray
+    front: np.ndarray  # [F] of the counter-clockwise side; an unoccluded one reaches about 0.5
+    back: np.ndarray  # [F]
 
 
 def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
     """The share of each face's two sides that parallel views from all around see.
 
-    Rays are aimed at points on the faces rather than spread over pictures: a small face is then judged by as
-    many rays as it needs, and none is missed for falling between pixels. A first round looks at every face,
-    large ones more often; a second looks again at the undecided ones.
+    Rays are aimed at points on the faces: a small one is then judged by as many as it needs. A first round
+    looks at every face, large ones more often; a second at those seen too little, or from either side.
     """
     observer = _Observer(mesh, rng.permutation(sphere_directions(views)), rng)
     large = (observer.area / observer.area.sum() * LARGE).astype(np.int64)
     observer.look(np.arange(len(large)), large + _rays_per_face(len(large), FIRST))
-    undecided = np.flatnonzero(_is_undecided(*observer.sums))
+    front, back, cast = observer.sums
+    undecided = np.flatnonzero((front + back < SURE * cast) | (np.minimum(front, back) > 0))
     if len(undecided):
         observer.look(undecided, AGAIN * large[undecided] + _rays_per_face(len(undecided), SECOND))
     return Sightings(*(observer.sums[:2] / np.maximum(observer.sums[2], 1e-12)))
@@ -93,19 +76,8 @@ def _rays_per_face(faces: int, most: int) -> int:
     return int(np.clip(RAYS // faces, most // 2, most))
 
 
-def _is_undecided(front: np.ndarray, back: np.ndarray, cast: np.ndarray) -> np.ndarray:
-    """[F] whether a face has too few sightings, or some from either side."""
-    return (front + back < SURE * cast) | (np.minimum(front, back) > 0)
-
-
 class _Observer:
-    """Casts rays from all around at the faces of one mesh, and sums up the sightings.
-
-    Args:
-        mesh: the faces to look at.
-        directions: [D, 3] towards the eye; a face takes them one after the other.
-        rng: of the points on the faces and of each face's first direction.
-    """
+    """Casts rays towards `directions` [D, 3] at the faces of one mesh, and sums up the sightings."""
 
     def __init__(self, mesh: NormalizedMesh, directions: np.ndarray, rng: np.random.Generator):
         self.directions, self.rng = directions.astype(np.float32), rng
@@ -113,7 +85,7 @@ class _Observer:
         normals = face_normals(mesh.vertices, mesh.faces)
         self.area = np.linalg.norm(normals, axis=1)
         self.normals = (normals / self.area[:, None]).astype(np.float32)
-        self.next = rng.integers(len(directions), size=len(mesh.faces))
+        self.next = rng.integers(len(directions), size=len(mesh.faces))  # a face takes one after the other
         self.sums = np.zeros((3, len(mesh.faces)))  # weighted by the cosine: front, back, cast
         self.scene = EmbreeScene()
         TriangleMesh(self.scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
@@ -150,21 +122,21 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
     Raises:
         RejectedMesh: too much of it are sheets, or too many sightings contradict each other.
     """
-    seen = sightings(mesh, preparation.views, rng)
-    total = seen.front + seen.back
-    wrong = np.minimum(seen.front, seen.back)
+    front, back = sightings(mesh, preparation.views, rng)
+    total, wrong, is_turned = front + back, np.minimum(front, back), back > front
     kept = total > preparation.hidden_below
     area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
-    faces = np.where((seen.back > seen.front)[:, None], mesh.faces[:, ::-1], mesh.faces)
+    faces = np.where(is_turned[:, None], mesh.faces[:, ::-1], mesh.faces)
     two_sided = kept & (wrong > preparation.two_sided_above * total)
     two_sided[two_sided] = ~_bounds_a_solid(mesh.vertices, faces[kept], faces[two_sided])
     if not (kept & ~two_sided).any():
-        what = "no visible face has a single visible side, so nothing has an inside"
-        raise RejectedMesh("two_sided_area", what)
+        raise RejectedMesh(
+            "two_sided_area", "no visible face has a single visible side: nothing has an inside"
+        )
     visible = np.where(kept, area, 0)
     statistics = {
         "hidden_area": float(area[~kept].sum() / area.sum()),
-        "turned_area": float(area[kept & (seen.back > seen.front)].sum() / area.sum()),
+        "turned_area": float(area[kept & is_turned].sum() / area.sum()),
         "two_sided_area": float(visible[two_sided].sum() / visible.sum()),
         "contradictory": float((visible * wrong).sum() / (visible * total).sum()),
         "bad_faces": float((visible * (wrong > BAD * total)).sum() / visible.sum()),
@@ -179,8 +151,7 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
 def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarray) -> np.ndarray:
     """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it.
 
-    A wall seen from within through a hole looks two-sided, but behind it the number is nearly 1. Behind a
-    sheet it is about 1/2, before it -1/2.
+    So it is at a wall seen from within through a hole, not at a sheet: there it is about 1/2 and -1/2.
     """
     normals = face_normals(vertices, suspects)
     step = STEP * normals / np.linalg.norm(normals, axis=1)[:, None]
@@ -192,11 +163,8 @@ def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarra
 
 def closed_surface(mesh: NormalizedMesh) -> Surface | None:
     """All faces, if they form one closed, consistently oriented shell of positive volume; else None."""
-    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    forward = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
-    backward = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
-    forward.sort()
-    backward.sort()
+    start, end = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    forward, backward = (np.sort(a * len(mesh.vertices) + b) for a, b in ((start, end), (end, start)))
     if (np.diff(forward) == 0).any() or not np.array_equal(forward, backward):
         return None  # an edge without exactly two faces, or two faces that run along it the same way
     normals = face_normals(mesh.vertices, mesh.faces)

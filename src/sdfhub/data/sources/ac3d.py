@@ -3,7 +3,7 @@
 Source: AC3D file format specification (inivis).
 """
 
-from dataclasses import dataclass
+import io
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +12,7 @@ from sdfhub.errors import RejectedMesh
 from sdfhub.shapes import Mesh
 
 MAX_DEPTH = 100
-POLYGON, STRIP = 0, 4
-"""Surface types with an area (the low four bits of `SURF`); 1 and 2 are closed and open lines."""
+POLYGON, STRIP = 0, 4  # surfaces with an area (low four bits of `SURF`); 1 and 2: closed and open lines
 
 
 def read_ac3d(content: bytes) -> Mesh:
@@ -26,84 +25,57 @@ def read_ac3d(content: bytes) -> Mesh:
     """
     if not content.startswith(b"AC3D"):
         raise RejectedMesh("corrupt_file", "does not start with AC3D")
-    reader, parts = _Reader(content), [Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
+    reader, parts = _Lines(content), [Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
     try:
         while (line := reader.next_line()) is not None:
             if line[:1] == ["OBJECT"]:
                 _read_object(reader, parts, np.eye(3), np.zeros(3), 0)
     except (ValueError, IndexError, OverflowError) as error:
-        raise RejectedMesh("corrupt_file", f"byte {reader.position}: {error}") from error
+        raise RejectedMesh("corrupt_file", f"byte {reader.tell()}: {error}") from error
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, first, strict=False)]
     return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
-@dataclass
-class _Reader:
-    """Lines of the file as lists of words, and the payloads between them."""
-
-    content: bytes
-    position: int = 0
+class _Lines(io.BytesIO):
+    """Lines of the file as lists of words."""
 
     def next_line(self) -> list[str] | None:
         """The words of the next line that is not blank, or None at the end."""
-        while self.position < len(self.content):
-            end = self.content.find(b"\n", self.position)
-            end = len(self.content) if end < 0 else end
-            words = self.content[self.position : end].decode("latin-1").split()
-            self.position = end + 1
-            if words:
-                return words
-        return None
+        return next((words for line in self if (words := line.decode("latin-1").split())), None)
 
     def line(self) -> list[str]:
         """The words of a line that must be there."""
-        words = self.next_line()
-        if words is None:
+        if (words := self.next_line()) is None:
             raise ValueError("the file ends in the middle of an object")
         return words
 
-    def rows(self, count: int, columns: int) -> np.ndarray:
-        """[count, columns] numbers, one row a line; the rest of a line is left out."""
-        if not 0 <= count <= len(self.content):
-            raise ValueError(f"{count} rows cannot be in this file")
-        rows = [self.line()[:columns] for _ in range(count)]
-        return np.array(rows, dtype=np.float64).reshape(count, columns)
-
-    def skip(self, count: int) -> None:
-        if not 0 <= count <= len(self.content) - self.position:
-            raise ValueError(f"a payload of {count} bytes cannot be in this file")
-        self.position += count + 1  # and the end of its line
-
 
 def _read_object(
-    reader: _Reader, parts: list[Mesh], rotation: np.ndarray, origin: np.ndarray, depth: int
+    reader: _Lines, parts: list[Mesh], rotation: np.ndarray, origin: np.ndarray, depth: int
 ) -> None:
-    """Reads one object and its kids, up to and with the last kid.
-
-    Args:
-        rotation: [3, 3] of the parent; rows of points are multiplied from the left.
-        origin: [3], the parent's origin in the world.
-    """
+    """Reads one object and its kids, given the parent's rotation [3, 3], from the left, and origin [3]."""
     if depth > MAX_DEPTH:
         raise ValueError(f"objects are nested more than {MAX_DEPTH} deep")
-    own_rotation, location, vertices, surfaces = np.eye(3), np.zeros(3), np.zeros((0, 3)), []
-    while True:
+    own_rotation, location, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
+    surfaces: list[tuple[int, int, int]] = []
+    kids = None
+    while kids is None:
         words = reader.line()
-        match words[:1]:
-            case ["rot"]:
+        match words[0]:
+            case "rot":
                 own_rotation = np.array(words[1:10], dtype=np.float64).reshape(3, 3)
-            case ["loc"]:
+            case "loc":
                 location = np.array(words[1:4], dtype=np.float64).reshape(3)
-            case ["data"]:
-                reader.skip(int(words[1]))
-            case ["numvert"]:
-                vertices = reader.rows(int(words[1]), 3)
-            case ["numsurf"]:
+            case "data":
+                reader.read(int(words[1]) + 1)  # and the end of its line
+            case "numvert":
+                rows = [reader.line()[:3] for _ in range(int(words[1]))]
+                vertices = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
+            case "numsurf":
                 surfaces = [face for _ in range(int(words[1])) for face in _read_surface(reader)]
-            case ["kids"]:
+            case "kids":
                 kids = int(words[1])
-                break
     origin = location @ rotation + origin
     rotation = own_rotation @ rotation
     faces = np.array(surfaces, dtype=np.int64).reshape(-1, 3)
@@ -111,14 +83,15 @@ def _read_object(
         raise ValueError("a surface has a vertex that is not there")
     parts.append(Mesh(vertices @ rotation + origin, faces))
     for _ in range(kids):
-        while (words := reader.next_line()) is not None and words[:1] != ["OBJECT"]:
-            pass
-        if words is None:
+        line = reader.next_line()
+        while line and line[0] != "OBJECT":
+            line = reader.next_line()
+        if not line:
             return  # many files announce more kids than they hold
         _read_object(reader, parts, rotation, origin, depth + 1)
 
 
-def _read_surface(reader: _Reader) -> list[tuple[int, int, int]]:
+def _read_surface(reader: _Lines) -> list[tuple[int, int, int]]:
     """The triangles of one surface; none for a line."""
     kind, words = POLYGON, reader.line()
     while words[:1] != ["refs"]:

@@ -13,19 +13,14 @@ from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Mesh
 
 FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
-MAX_BYTES = 1 << 30
-"""A larger file is refused before it is read: text formats take some ten times their size in memory."""
-MAX_VERTICES = 50_000_000
-"""Of a glTF's scene: a small file may draw one mesh many times."""
+MAX_BYTES = 1 << 30  # of a file: text formats take some ten times their size in memory
+MAX_VERTICES = 50_000_000  # of a glTF's scene: a small file may draw one mesh many times
 
 _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """The mesh in a file, in the file's frame and units.
-
-    The parts of a scene are put together under their transforms; polygons become triangles. Vertices are
-    neither merged nor dropped.
+    """The mesh in a file, in the file's frame and units: parts of a scene in place, polygons as triangles.
 
     Raises:
         SdfhubError: the file is missing, too large or of no known format.
@@ -42,11 +37,10 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = None) -> Mesh:
-    """The triangles of a mesh file's content; see `read_mesh`.
+    """The triangles of a whole mesh file's content; see `read_mesh`.
 
     Args:
-        content: the whole file.
-        suffix: one of FORMATS.
+        content, suffix: of the file; one of FORMATS.
         name: of the file in messages.
         folder: where a .gltf finds its buffers; None forbids other files.
     """
@@ -57,9 +51,8 @@ def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = N
         raise RejectedMesh("non_finite_vertices", f"{name} has the line {line!r}")
     try:
         check_length(content, suffix)
-        if suffix in (".glb", ".gltf"):
-            _check_gltf(content, suffix)
-        mesh = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, folder)
+        buffers = _gltf_buffers(content, suffix, folder) if suffix in (".glb", ".gltf") else {}
+        mesh = read_ac3d(content) if suffix == ".ac" else _by_trimesh(content, suffix, buffers)
     except RejectedMesh as rejection:
         raise RejectedMesh(rejection.reason, f"{name}: {rejection.detail}") from rejection
     except MemoryError:  # no fault of the file
@@ -68,7 +61,13 @@ def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = N
         is_foreign = isinstance(error, ImportError)  # it would guess the encoding of binary content
         why = "not of this format" if is_foreign else f"{type(error).__name__}: {error}"
         raise RejectedMesh("corrupt_file", f"{name} cannot be read as {suffix[1:]} ({why})") from error
-    _check_triangles(*mesh, name)
+    vertices, faces = mesh
+    if not faces.size:
+        raise RejectedMesh("no_faces", f"{name} holds no faces: a point cloud, not a mesh")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise RejectedMesh("corrupt_file", f"{name} has a face with a vertex that is not there")
+    if bad_rows := int((~np.isfinite(vertices)).any(axis=1).sum()):
+        raise RejectedMesh("non_finite_vertices", f"{name} has {bad_rows} vertices that are not finite")
     return mesh
 
 
@@ -91,27 +90,52 @@ def check_length(content: bytes, suffix: str) -> None:
         raise RejectedMesh("corrupt_file", f"ends too early: its header promises {promised}, it holds {held}")
 
 
-def _check_gltf(content: bytes, suffix: str) -> None:
-    """Refuses a glTF whose vertices trimesh would replace by zeros, or that claims more than memory holds."""
+def _gltf_buffers(content: bytes, suffix: str, folder: Path | None) -> dict[str, bytes]:
+    """The files that a glTF names; its paths are not trusted.
+
+    Refuses one whose vertices trimesh would replace by zeros, or that claims more than memory holds.
+    """
     if suffix == ".glb":
-        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+        content, folder = content[20 : 20 + int.from_bytes(content[12:16], "little")], None
     scene = json.loads(content)
-    primitives = [primitive for mesh in scene.get("meshes", []) for primitive in mesh["primitives"]]
+    meshes, accessors = scene.get("meshes", []), scene.get("accessors", [])
     names = {*scene.get("extensionsRequired", []), *scene.get("extensions", {})}
-    names = names.union(*(primitive.get("extensions", {}) for primitive in primitives))
-    packed = {name for name in names if "compression" in name}
-    if packed:
-        raise RejectedMesh("compressed", f"needs {', '.join(sorted(packed))}; export it without compression")
-    accessors = scene.get("accessors", [])
+    names = names.union(*(part.get("extensions", {}) for mesh in meshes for part in mesh["primitives"]))
+    if packed := sorted(name for name in names if "compression" in name):
+        raise RejectedMesh("compressed", f"needs {', '.join(packed)}; export it without compression")
     if any("bufferView" not in accessor and "sparse" not in accessor for accessor in accessors):
         raise RejectedMesh("corrupt_file", "claims numbers that it does not hold")
     counts = [
         sum(accessors[part["attributes"]["POSITION"]]["count"] for part in mesh["primitives"])
-        for mesh in scene.get("meshes", [])
+        for mesh in meshes
     ]
     drawn = sum(counts[node["mesh"]] for node in scene.get("nodes", []) if "mesh" in node)
     if drawn > MAX_VERTICES:
         raise RejectedMesh("too_large", f"draws {drawn:,} vertices, at most {MAX_VERTICES:,} are read")
+    buffers = {}
+    for name in buffer_names(scene):
+        if not (path := buffer_path(folder, name)):
+            raise RejectedMesh("corrupt_file", f"its buffer {name!r} does not lie beside it")
+        buffers[name] = path.read_bytes()
+    return buffers
+
+
+def buffer_names(scene: dict) -> list[str]:
+    """The files that a glTF's JSON names."""
+    names = [buffer.get("uri", "data:") for buffer in scene.get("buffers", [])]
+    return [name for name in names if not name.startswith("data:")]
+
+
+def buffer_path(folder: Path | None, name: str) -> Path | None:
+    """Where a file that a .gltf in `folder` names lies, or None where that is not below it, or too large.
+
+    Names are percent-encoded; some exporters write them as they are.
+    """
+    if not folder:
+        return None
+    paths = [(folder / spelling).resolve() for spelling in (name, unquote(name))]
+    paths = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
+    return paths[0] if paths and paths[0].stat().st_size <= MAX_BYTES else None
 
 
 def _lines(body: bytes) -> int:
@@ -119,79 +143,16 @@ def _lines(body: bytes) -> int:
     return sum(1 for line in body.splitlines() if line.strip())
 
 
-def _by_trimesh(content: bytes, suffix: str, folder: Path | None) -> Mesh:
+def _by_trimesh(content: bytes, suffix: str, buffers: dict[str, bytes]) -> Mesh:
     import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
 
-    options = {}
-    if suffix in (".obj", ".off"):
-        content = _utf8(content)
-    if suffix in (".obj", ".glb", ".gltf"):
-        options["skip_materials"] = True
-    files = _Beside(folder if suffix == ".gltf" else None)
-    with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused below
-        mesh = trimesh.load_mesh(
-            io.BytesIO(content), file_type=suffix[1:], process=False, resolver=files, **options
-        )
+    if suffix in (".obj", ".off"):  # names and comments may be in any encoding, numbers are the same in all
+        try:
+            content.decode()
+        except UnicodeDecodeError:
+            content = content.decode("latin-1").encode()
+    options = {"skip_materials": True} if suffix in (".obj", ".glb", ".gltf") else {}
+    file, kind = io.BytesIO(content), suffix[1:]
+    with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused later
+        mesh = trimesh.load_mesh(file, file_type=kind, process=False, resolver=buffers, **options)
     return Mesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))
-
-
-def _utf8(content: bytes) -> bytes:
-    """Text in any encoding as UTF-8: names and comments may be in another, numbers are the same in all."""
-    try:
-        content.decode()
-    except UnicodeDecodeError:
-        return content.decode("latin-1").encode()
-    return content
-
-
-def _check_triangles(vertices: np.ndarray, faces: np.ndarray, name: str) -> None:
-    if not faces.size:
-        raise RejectedMesh("no_faces", f"{name} holds no faces: a point cloud, not a mesh")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise RejectedMesh("corrupt_file", f"{name} has a face with a vertex that is not there")
-    if not np.isfinite(vertices).all():
-        count = int((~np.isfinite(vertices)).any(axis=1).sum())
-        raise RejectedMesh("non_finite_vertices", f"{name} has {count} vertices that are not finite")
-
-
-class _Beside:
-    """Gives a .gltf the buffers that lie below its own folder and nothing else: its paths are not trusted.
-
-    A resolver to trimesh, by its methods rather than by descent, which would import trimesh.
-    """
-
-    def __init__(self, folder: Path | None):
-        self.folder = folder
-
-    def get(self, name: str) -> bytes:
-        path = buffer_path(self.folder, name)
-        if path is None:
-            raise FileNotFoundError(f"its buffer {name!r} does not lie beside it")
-        return path.read_bytes()
-
-    def __getitem__(self, name: str) -> bytes:
-        return self.get(name)
-
-    def __contains__(self, name: str) -> bool:
-        return False
-
-    def keys(self):
-        return []
-
-    def write(self, name, data):
-        raise PermissionError("meshes are only read")
-
-    def namespaced(self, namespace):
-        return self
-
-
-def buffer_path(folder: Path | None, name: str) -> Path | None:
-    """Where a file that a .gltf names lies, or None where it is not below `folder` or too large.
-
-    Args:
-        folder: of the .gltf.
-        name: percent-encoded, as the format has it; some exporters write names as they are.
-    """
-    paths = [(folder / spelling).resolve() for spelling in (name, unquote(name))] if folder else []
-    paths = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
-    return paths[0] if paths and paths[0].stat().st_size <= MAX_BYTES else None

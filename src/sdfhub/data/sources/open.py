@@ -3,25 +3,49 @@
 import hashlib
 import json
 import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
+from pydantic import BaseModel
 
-from sdfhub.data.sources.furniture import furniture_in, read_model
 from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
-from sdfhub.data.sources.source import Shape, Source, folder_safe, plain_categories
+from sdfhub.data.sources.source import Shape, Source, checked_categories, folder_safe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Mesh
 from sdfhub.triangles import face_normals
 from sdfhub.whole_file import write_whole
 
-MEASURES = ".measured.json"
-"""Cache below the root: faces, extents, area and hash of the models seen so far, by file size and date."""
-
+MEASURES = ".measured.json"  # a cache: faces, size and hash of the models seen so far, by file and date
+CATALOGUE = "PluginFurnitureCatalog.properties"
+MAX_CATALOGUE, MAX_MODEL = 16 << 20, 256 << 20  # bytes unpacked: a small archive may claim any size
 AIRCRAFT_CREDITS = {"author": "the FlightGear team", "licence": "GPL-2+"}
+
+
+class Catalogue(BaseModel, extra="forbid"):
+    """Which furniture a category takes: regular expressions of catalogue names, lower case."""
+
+    include: re.Pattern[str]
+    exclude: re.Pattern[str] | None = None
+
+
+class Aircraft(BaseModel, extra="forbid"):
+    """Which aircraft a category takes: those whose path `exclude` does not find, of so many triangles."""
+
+    exclude: re.Pattern[str] | None = None
+    min_faces: int = 1
+
+
+class Rules(BaseModel):
+    """What a category takes of the two packages; it may have other settings, too."""
+
+    catalogue: Catalogue | None = None
+    aircraft: Aircraft | None = None
 
 
 @dataclass(frozen=True)
@@ -31,8 +55,8 @@ class _Model:
     category: str
     file: Path
     member: str
-    title: str
     credits: dict[str, str]
+    min_faces: int = 1
 
     def content(self) -> bytes:
         if self.member:
@@ -45,10 +69,16 @@ class _Model:
         name = self.member or self.file.name
         return triangles_of(self.content(), Path(name).suffix.lower(), f"{self.file.name}: {name}")
 
-    def key(self, root: Path) -> str:
-        state = self.file.stat()
-        where = self.file.relative_to(root).as_posix()
-        return f"{where} {state.st_size} {state.st_mtime_ns} {self.member}"
+    def measured(self) -> dict[str, Any]:
+        """Faces, hash, and extents and area, which twins share; a file that cannot be read has no faces."""
+        try:
+            vertices, faces = self.triangles()
+        except RejectedMesh:
+            return {"faces": 0}
+        extents = np.ptp(vertices[faces.ravel()], axis=0)
+        area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
+        twin = " ".join(f"{value:.4g}" for value in (*extents, area))
+        return {"faces": len(faces), "twin": twin, "sha256": hashlib.sha256(self.content()).hexdigest()}
 
 
 class OpenSource(Source):
@@ -66,29 +96,36 @@ class OpenSource(Source):
 
     name = "open"
 
-    def __init__(self, categories: Mapping, root: str = "data/open"):
-        self.categories = plain_categories(categories)
-        for name, settings in self.categories.items():
-            _check_patterns(name, settings)
-        self.root = Path(root)
+    def __init__(self, categories: Mapping[str, Any], root: str = "data/open"):
+        self.rules, self.root = checked_categories(categories, Rules), Path(root)
         self._models: dict[str, _Model] = {}
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
             raise SdfhubError(f"data.source.root={self.root}: no such folder; fetch it with `make data`")
-        known = self._read_measures()
-        measured = [(model, self._measure(model, known)) for model in self._candidates()]
-        self._write_measures(known)
-        self._models, shapes, seen = {}, [], set()
-        for model, measure in measured:
+        known: dict[str, dict[str, Any]] = {}
+        with suppress(OSError, ValueError, TypeError):
+            known |= json.loads((self.root / MEASURES).read_text())
+        before, shapes, seen = len(known), [], set()
+        for model in self._candidates():
+            state, below = model.file.stat(), model.file.relative_to(self.root).as_posix()
+            key = f"{below} {state.st_size} {state.st_mtime_ns} {model.member}"
+            measure = known.get(key) or model.measured()
+            if measure["faces"]:  # a model that cannot be read is tried again: it may be this machine's fault
+                known[key] = measure
             twin = (model.category, measure.get("twin"))
-            if measure.get("faces", 0) < self._min_faces(model) or twin in seen:
+            if measure["faces"] < model.min_faces or twin in seen:
                 continue
             seen.add(twin)
-            shapes.append(self._shape(model, measure["sha256"]))
-            self._models[shapes[-1].id] = model
+            suffix = hashlib.sha256(f"{below}\n{model.member}".encode()).hexdigest()[:6]
+            id = f"{folder_safe(model.category)}/{folder_safe(model.credits['title'].lower())}-{suffix}"
+            shapes.append(Shape(id, model.category, measure["sha256"], credits=model.credits))
+            self._models[id] = model
+        if len(known) > before:
+            with suppress(OSError):  # a root that is read-only is measured every time
+                write_whole(self.root / MEASURES, json.dumps(known, indent=1, sort_keys=True))
         if not shapes:
-            what = f"no models of {', '.join(self.categories)}; fetch them with `make data`"
+            what = f"no models of {', '.join(self.rules)}; fetch them with `make data`"
             raise SdfhubError(f"data.source.root={self.root}: {what}")
         return sorted(shapes, key=lambda shape: shape.id)
 
@@ -98,82 +135,75 @@ class OpenSource(Source):
         return self._models[shape.id].triangles()
 
     def _candidates(self) -> Iterator[_Model]:
-        for name, settings in sorted(self.categories.items()):
-            if settings.get("catalogue"):
-                yield from self._furniture(name, **settings["catalogue"])
-            if settings.get("aircraft"):
-                yield from self._aircraft(name, settings["aircraft"].get("exclude"))
-
-    def _furniture(self, category: str, include: str, exclude: str | None = None) -> Iterator[_Model]:
-        for archive in sorted(self.root.rglob("*.sh3f")):
-            for item in furniture_in(archive):
-                title = item.title.lower()
-                if re.search(include, title) and not (exclude and re.search(exclude, title)):
-                    yield _Model(category, archive, item.member, item.title, item.credits)
-
-    def _aircraft(self, category: str, exclude: str | None) -> Iterator[_Model]:
-        for file in sorted(self.root.rglob("AI/Aircraft/**/*.ac")):
-            below = file.as_posix().rpartition("AI/Aircraft/")[2]
-            if not (exclude and re.search(exclude, below.lower())):
-                title = f"{below.partition('/')[0]} {file.stem}"
-                yield _Model(category, file, "", title, AIRCRAFT_CREDITS | {"title": title})
-
-    def _min_faces(self, model: _Model) -> int:
-        aircraft = {} if model.member else self.categories[model.category]["aircraft"]
-        return int(aircraft.get("min_faces", 1))
-
-    def _shape(self, model: _Model, sha256: str) -> Shape:
-        where = f"{model.file.relative_to(self.root).as_posix()}\n{model.member}"
-        suffix = hashlib.sha256(where.encode()).hexdigest()[:6]
-        id = f"{folder_safe(model.category)}/{folder_safe(model.title.lower())}-{suffix}"
-        return Shape(id, model.category, sha256, credits=model.credits)
-
-    def _measure(self, model: _Model, known: dict[str, dict]) -> dict:
-        key = model.key(self.root)
-        if known.get(key, {}).get("faces"):
-            return known[key]
-        measure = _measured(model)
-        if measure["faces"]:  # a model that cannot be read is tried again: the fault may be this machine's
-            known[key] = measure
-        return measure
-
-    def _read_measures(self) -> dict[str, dict]:
-        with suppress(OSError, ValueError):
-            known = json.loads((self.root / MEASURES).read_text())
-            return known if isinstance(known, dict) else {}
-        return {}
-
-    def _write_measures(self, known: dict[str, dict]) -> None:
-        content = json.dumps(known, indent=1, sort_keys=True).encode()
-        with suppress(OSError):  # a root that is read-only is measured every time
-            if not (self.root / MEASURES).is_file() or (self.root / MEASURES).read_bytes() != content:
-                write_whole(self.root / MEASURES, content)
+        for category, rules in sorted(self.rules.items()):
+            if rules.catalogue:
+                include, exclude = rules.catalogue.include, rules.catalogue.exclude
+                for archive in sorted(self.root.rglob("*.sh3f")):
+                    for member, credits in furniture_in(archive):
+                        title = credits["title"].lower()
+                        if include.search(title) and not (exclude and exclude.search(title)):
+                            yield _Model(category, archive, member, credits)
+            if rules.aircraft:
+                exclude = rules.aircraft.exclude
+                for file in sorted(self.root.rglob("AI/Aircraft/**/*.ac")):
+                    below = file.as_posix().rpartition("AI/Aircraft/")[2]
+                    if not (exclude and exclude.search(below.lower())):
+                        title = f"{below.partition('/')[0]} {file.stem}"
+                        credits = AIRCRAFT_CREDITS | {"title": title}
+                        yield _Model(category, file, "", credits, rules.aircraft.min_faces)
 
 
-_FIELDS = {"catalogue": {"include", "exclude"}, "aircraft": {"exclude", "min_faces"}}
+def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Of a library's OBJ models, in the catalogue's order: name in the archive; author, licence and title.
 
-
-def _check_patterns(category: str, settings: dict) -> None:
-    for group, fields in _FIELDS.items():
-        given, key = settings.get(group) or {}, f"category.{category}.{group}"
-        if not isinstance(given, dict) or not given.keys() <= fields:
-            raise SdfhubError(f"{key}: expected {' and '.join(sorted(fields))} or null, got {given}")
-        if given and "include" in fields and not given.get("include"):
-            raise SdfhubError(f"{key}.include: a regular expression is missing")
-        for field in given.keys() & {"include", "exclude"}:
-            try:
-                re.compile(given[field] or "")
-            except (re.error, TypeError) as error:
-                raise SdfhubError(f"{key}.{field}={given[field]}: no regular expression: {error}") from error
-
-
-def _measured(model: _Model) -> dict:
-    """Faces, hash, and extents and area, which twins share; a file that cannot be read has no faces."""
+    Raises:
+        SdfhubError: not a zip archive with a catalogue.
+    """
     try:
-        vertices, faces = model.triangles()
-    except RejectedMesh:
-        return {"faces": 0}
-    extents = np.ptp(vertices[faces.ravel()], axis=0)
-    area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
-    twin = " ".join(f"{value:.4g}" for value in (*extents, area))
-    return {"faces": len(faces), "twin": twin, "sha256": hashlib.sha256(model.content()).hexdigest()}
+        with zipfile.ZipFile(archive) as library:
+            entries = parse_properties(_content(library, CATALOGUE, MAX_CATALOGUE).decode("latin-1"))
+            members = set(library.namelist())
+    except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
+        raise SdfhubError(f"{archive}: not a furniture library ({error}); fetch it again") from error
+    for number in sorted(int(key[5:]) for key in entries if re.fullmatch(r"name#\d{1,9}", key)):
+        entry = {key: entries.get(f"{key}#{number}", "") for key in ("name", "model", "creator", "license")}
+        names = (name.lstrip("/") for name in (entry["model"], unquote(entry["model"])))
+        member = next((name for name in names if name in members and ".." not in name.split("/")), "")
+        if member.lower().endswith(".obj"):
+            licence = entry["license"] or entries.get("license", "")
+            yield member, {"author": entry["creator"], "licence": licence, "title": entry["name"]}
+
+
+def read_model(archive: Path, member: str) -> bytes:
+    """The content of a model within its library.
+
+    Raises:
+        RejectedMesh: corrupt_file; the archive is damaged there, or the model larger than MAX_MODEL.
+    """
+    try:
+        with zipfile.ZipFile(archive) as library:
+            return _content(library, member, MAX_MODEL)
+    except MemoryError:
+        raise
+    except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
+        raise RejectedMesh("corrupt_file", f"{archive}: {member}: {error}") from error
+
+
+def parse_properties(text: str) -> dict[str, str]:
+    r"""Keys and values of a Java properties file: comments, `\` at a line's end, and `\uXXXX` are known."""
+    joined = re.sub(r"\\\r?\n[ \t]*", "", text)
+    pairs = re.findall(r"^[ \t]*([^#!\s=:][^\s=:]*)[ \t]*[=:][ \t]*(.*?)[ \t\r]*$", joined, re.MULTILINE)
+    return {key: _unescaped(value) for key, value in pairs}
+
+
+def _unescaped(value: str) -> str:
+    letters = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), value)
+    return re.sub(r"\\(.)", r"\1", letters).strip()
+
+
+def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:
+    with library.open(member) as file:
+        content = file.read(limit + 1)  # the size in its header is not to be trusted
+    if len(content) > limit:
+        raise RejectedMesh("corrupt_file", f"{member} unpacks to more than {limit >> 20} MiB")
+    return content

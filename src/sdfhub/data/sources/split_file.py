@@ -1,15 +1,58 @@
-"""Split files: which shapes somebody else trained and tested on."""
+"""Sources of files below a root, and split files: which of them somebody else trained and tested on."""
 
 import json
 import logging
+import os
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from sdfhub.data.sources.source import Shape
+from sdfhub.data.sources.source import Role, Shape, Source, digits, folder_safe
 from sdfhub.errors import SdfhubError
+from sdfhub.shapes import Mesh, ShapeSamples
 
 log = logging.getLogger(__name__)
+
+
+class SourceOfFiles(Source):
+    """A source of one file per shape below a root; split files may give roles.
+
+    Args:
+        kind: beginning of its name.
+        root: the folder that holds the files.
+        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
+            either is given, unlisted shapes are left out. None lets a seed decide.
+    """
+
+    def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
+        self.root = Path(os.path.abspath(root))
+        self.train_split = train_split and os.path.abspath(train_split)
+        self.test_split = test_split and os.path.abspath(test_split)
+        place = self.root.resolve()
+        self.name = f"{kind}-{folder_safe(place.name)}-{digits(place)}"
+        self._files: dict[str, Path] = {}
+
+    @abstractmethod
+    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
+        """Each shape by id with its file, and its path below the root as split files have it."""
+
+    @abstractmethod
+    def read(self, file: Path) -> Mesh | ShapeSamples:
+        """What a shape's file holds."""
+
+    def shapes(self) -> list[Shape]:
+        if not self.root.is_dir():
+            what = "a file, not a folder" if self.root.exists() else "no such folder"
+            raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
+        listed = list(self.listed())
+        self._files = {shape.id: file for shape, file, _ in listed}
+        return with_roles([(shape, path) for shape, _, path in listed], self.train_split, self.test_split)
+
+    def load(self, shape: Shape) -> Mesh | ShapeSamples:
+        if not self._files:
+            self.shapes()
+        return self.read(self._files[shape.id])
 
 
 def with_roles(
@@ -19,31 +62,25 @@ def with_roles(
 
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
     of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
-    name is the path of a shape's file, or its last parts, without the suffix.
-
-    Args:
-        shapes: each with its path below the source's root, without suffix.
-        train_split: file that lists the training shapes, or None.
-        test_split: file that lists the held-out shapes, or None.
+    name is the path of a file below the root, as beside each shape, or its last parts, without suffix.
 
     Raises:
         SdfhubError: a file is missing or of another form, lists nothing that is there, or both list a shape.
     """
     if not train_split and not test_split:
         return [shape for shape, _ in shapes]
-    role_of: dict[str, str] = {}
-    for role, file in (("train", train_split), ("held_out", test_split)):
+    role_of: dict[str, Role] = {}
+    files: dict[Role, str | None] = {"train": train_split, "held_out": test_split}
+    for role, file in files.items():
         listed = _ids_listed(shapes, file, role) if file else []
-        both = next((id for id in listed if id in role_of), None)
-        if both:
+        if both := next((id for id in listed if id in role_of), None):
             raise SdfhubError(f"{file}: {both} is in the training split as well")
         role_of |= dict.fromkeys(listed, role)
     return [replace(shape, split=role_of[shape.id]) for shape, _ in shapes if shape.id in role_of]
 
 
-def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[str]:
-    names = set(names_listed(file, role))
-    paths = {path for _, path in shapes}
+def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: Role) -> list[str]:
+    names, paths = set(names_listed(file, role)), {path for _, path in shapes}
     vague = names - paths  # the others name one path each
     endings = {ending for name in vague for ending in _endings(name)}
     listed = [
@@ -54,14 +91,13 @@ def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: str) -> list[s
     if not listed:
         raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
     there = {ending for path in paths for ending in _endings(path)}
-    lost = sorted(name for name in vague if name not in there and paths.isdisjoint(_endings(name)))
-    if lost:
+    if lost := sorted(name for name in vague if name not in there and paths.isdisjoint(_endings(name))):
         what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
         log.warning(f"{file}: {what}, such as {lost[0]}")
     return listed
 
 
-def names_listed(file: str, role: str) -> Iterator[str]:
+def names_listed(file: str, role: Role) -> Iterator[str]:
     """The names that a split file lists for a role, in its order; nested keys become parts of a path."""
     try:
         content = json.loads(Path(file).read_text())

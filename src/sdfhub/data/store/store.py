@@ -7,7 +7,6 @@ Each shape's file is written beside its place and renamed. Files whose size or d
 checksum was compared are compared again, and prepared again where they are damaged.
 """
 
-import dataclasses
 import hashlib
 import json
 import logging
@@ -18,15 +17,20 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from tqdm import tqdm
 
-from sdfhub.data.preparation.sampling import Preparation, prepare_mesh
+from sdfhub.data.preparation.sampling import prepare_mesh
+from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
 from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_of, write_shape
 from sdfhub.data.workers import Crashed, map_in_processes
+from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
 from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
@@ -34,19 +38,13 @@ from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-VERSION = 3
-"""Of the layout on disk and of how samples are made; stores of another version are not reused."""
-
+VERSION = 3  # of the layout on disk and of how samples are made; other stores are not reused
 INDEX = "index.json"
-
-TRIED_AGAIN = ("error", "crash")
-"""Reasons that lie in the machine or the program rather than the mesh: such shapes are tried again."""
-
-_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{12}")
+TRIED_AGAIN = ("error", "crash")  # reasons that lie in the machine or the program rather than the mesh
 
 
-class Store:
-    """Prepared shapes of one source under one preparation.
+class Store(dict[str, StoredShape]):
+    """Prepared shapes of one source under one preparation by id, in the order asked for.
 
     Args:
         folder: of the store.
@@ -55,67 +53,37 @@ class Store:
 
     def __init__(self, folder: Path, shapes: Iterable[StoredShape]):
         shapes = list(shapes)
+        super().__init__({shape.id: shape for shape in shapes if not shape.record.reason})
         self.folder = folder
         self.rejected: dict[str, Record] = {shape.id: shape.record for shape in shapes if shape.record.reason}
-        self._shapes = {shape.id: shape for shape in shapes if not shape.record.reason}
 
     @classmethod
-    def open(cls, root: str | Path, ids: Iterable[str] | None = None) -> "Store":
-        """The store whose files lie in `root`, limited to `ids`; None takes all it has.
+    def open(cls, folder: Path, up: Literal["y", "z"] = "z") -> "Store":
+        """All shapes whose files lie in `folder`; raises SdfhubError where there are none."""
+        files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
+        paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
+        ids = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
+        if not ids:
+            raise SdfhubError(f"{folder}: holds no prepared shapes; run `sdfhub prepare` first")
+        return cls(folder, _read(folder, ids, up, logging.WARNING).values())
 
-        Raises:
-            SdfhubError: no prepared shapes there, or a shape that was never prepared.
-        """
-        folder = Path(root)
-        there = _ids_in(folder)
-        if not there:
-            raise SdfhubError(f"{root}: holds no prepared shapes; run `sdfhub prepare` first")
-        ids = there if ids is None else list(ids)
-        shapes = _read(folder, [id for id in ids if id in set(there)])
-        if missing := [id for id in ids if id not in shapes]:
-            raise SdfhubError(f"{folder}: shape {missing[0]} has not been prepared; run `sdfhub prepare`")
-        return cls(folder, shapes.values())
-
-    @property
-    def ids(self) -> list[str]:
-        """The kept shapes, in the order asked for."""
-        return list(self._shapes)
-
-    def __len__(self) -> int:
-        return len(self._shapes)
-
-    def __contains__(self, id: str) -> bool:
-        return id in self._shapes
-
-    def __iter__(self) -> Iterator[StoredShape]:
-        return iter(self._shapes.values())
-
-    def __getitem__(self, id: str) -> StoredShape:
-        if id in self.rejected:
-            raise SdfhubError(f"shape {id} was rejected: {self.rejected[id].reason}")
-        if id not in self._shapes:
-            raise SdfhubError(f"shape {id} is not among the {len(self)} shapes opened from {self.folder}")
-        return self._shapes[id]
+    def __missing__(self, id: str) -> StoredShape:
+        why = f"was rejected: {self.rejected[id].reason}" if id in self.rejected else "is not there"
+        raise SdfhubError(f"{self.folder}: shape {id} {why}")
 
     def summary(self) -> str:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
-        reasons = Counter(record.reason for record in self.rejected.values())
-        seconds = sum(shape.record.seconds for shape in self) / max(1, len(self))
+        seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
-        for reason, count in reasons.most_common():
+        for reason, count in Counter(record.reason for record in self.rejected.values()).most_common():
             id, detail = next((id, r.detail) for id, r in self.rejected.items() if r.reason == reason)
             lines.append(f"  rejected {count} x {reason}, such as {id} ({detail})")
         return "\n".join(lines)
 
 
 def prepare(
-    source: Source,
-    shapes: list[Shape],
-    preparation: Preparation,
-    root: str | Path,
-    workers: int | None = None,
-    progress: bool = True,
+    source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> Store:
     """The store holding `shapes`, preparing those that it lacks.
 
@@ -129,28 +97,23 @@ def prepare(
         preparation: the settings, part of the store's folder name.
         root: folder of all stores.
         workers: processes; None takes one per core, 1 works in this process.
-        progress: show a bar.
 
     Raises:
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
-    folder = Path(root) / source.name / preparation_hash(preparation)
-    stored = _checked(folder, shapes, source)
+    folder = root / source.name / preparation_hash(preparation)
+    stored = _checked(folder, shapes, source, preparation, quiet=True)
     if _left(shapes, stored):
-        with _writing(folder), locked(folder / ".lock", waiting=f"store: {folder}: {_WAITING}"):
+        waiting = f"store: {folder}: waiting for another process that prepares it"
+        with _writing(folder), locked(folder / ".lock", waiting=waiting):
             _remove_leftovers(folder)
             # another process may have filled it meanwhile
-            left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
-            made: list[str] = []
-            try:
-                for shape, result in _prepared(source, left, preparation, folder, workers, progress):
-                    if isinstance(result, Crashed):
-                        write_shape(_file(folder, shape.id), {}, _rejection(shape, "crash", _CRASH))
-                    made.append(shape.id)
-            finally:  # a run that is interrupted keeps what it has
-                fresh = _read(folder, made, source.up)
-                _remember(folder, fresh, {"source": source.name} | dataclasses.asdict(preparation))
-        stored = _checked(folder, shapes, source)
+            left = _left(shapes, _checked(folder, shapes, source, preparation))
+            for shape, is_crash in _prepared(source, left, preparation, folder, workers):
+                if is_crash:
+                    what = "the worker process died: out of memory, or a fault in a native library"
+                    write_shape(_file(folder, shape.id), {}, _record(shape, "crash", what))
+        stored = _checked(folder, shapes, source, preparation)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
         what = "; ".join(line.strip() for line in store.summary().splitlines())
@@ -159,35 +122,22 @@ def prepare(
 
 
 def prepare_part(
-    source: Source,
-    shapes: list[Shape],
-    preparation: Preparation,
-    root: str | Path,
-    workers: int | None = None,
-    progress: bool = True,
+    source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> int:
-    """Prepares some of a store's shapes; several processes or machines may do so side by side.
-
-    Args:
-        shapes: this part's own; the other arguments are those of `prepare`.
+    """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
 
     Returns:
-        How many were prepared or rejected; the others were there, or are left to the next call, since
-        their worker died.
-
-    Raises:
-        SdfhubError: the store cannot be written.
+        How many were prepared or rejected; those whose worker died are left to the next call.
     """
-    folder = Path(root) / source.name / preparation_hash(preparation)
+    folder = root / source.name / preparation_hash(preparation)
     with _writing(folder):
-        left = _left(shapes, _checked(folder, shapes, source, logging.WARNING))
-        results = _prepared(source, left, preparation, folder, workers, progress)
-        return sum(not isinstance(result, Crashed) for _, result in results)
+        left = _left(shapes, _checked(folder, shapes, source, preparation))
+        return sum(not is_crash for _, is_crash in _prepared(source, left, preparation, folder, workers))
 
 
 def preparation_hash(preparation: Preparation) -> str:
     """12 hex digits that change with every setting of the preparation and with VERSION."""
-    settings = json.dumps([VERSION, dataclasses.asdict(preparation)], sort_keys=True)
+    settings = json.dumps([VERSION, asdict(preparation)], sort_keys=True, default=describe)
     return hashlib.sha256(settings.encode()).hexdigest()[:12]
 
 
@@ -197,72 +147,48 @@ def shape_seed(shape: Shape | StoredShape) -> int:
     return int.from_bytes(digest[:8], "big") >> 1
 
 
-def prepare_shape(source: Source, shape: Shape, preparation: Preparation, folder: Path) -> None:
-    """Loads, samples and writes one shape, or the reason why it is rejected. Never raises for a bad mesh.
-
-    Raises:
-        OSError: the store cannot be written, which no other shape would survive either.
-    """
-    start = time.perf_counter()
-    arrays = {}
+def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape: Shape) -> None:
+    """Loads, samples and writes one shape, or why it is rejected; only the store can make it fail."""
+    start, seed = time.perf_counter(), shape_seed(shape)
+    arrays: dict[str, np.ndarray] = {}
     try:
         loaded = source.load(shape)
-        is_sampled = isinstance(loaded, ShapeSamples)
-        samples = loaded if is_sampled else prepare_mesh(loaded, preparation, shape_seed(shape))
-        arrays = arrays_of(samples, shape_seed(shape))
+        samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
+        arrays = arrays_of(samples, seed)
+        x, y, z = samples.center.tolist()
         statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = Record(shape.fingerprint, shape.category, shape.credits, statistics=statistics)
-        center = tuple(samples.center.tolist())
-        record = dataclasses.replace(record, center=center, scale=float(samples.scale))
+        record = replace(
+            _record(shape, None), center=(x, y, z), scale=float(samples.scale), statistics=statistics
+        )
     except RejectedMesh as rejection:
-        record = _rejection(shape, rejection.reason, rejection.detail)
+        record = _record(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
-        record = _rejection(shape, "error", f"{type(error).__name__}: {error}")
+        record = _record(shape, "error", f"{type(error).__name__}: {error}")
     seconds = round(time.perf_counter() - start, 4)
-    write_shape(_file(folder, shape.id), arrays, dataclasses.replace(record, seconds=seconds))
+    write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
-@dataclasses.dataclass(frozen=True)
-class _PrepareShape:
-    """`prepare_shape` with all but the shape filled in; pickles into worker processes."""
-
-    source: Source
-    preparation: Preparation
-    folder: Path
-
-    def __call__(self, shape: Shape) -> None:
-        prepare_shape(self.source, shape, self.preparation, self.folder)
-
-
-_WAITING = "waiting for another process that prepares it"
-_CRASH = "the worker process died: out of memory, or a fault in a native library"
-
-
-def _rejection(shape: Shape, reason: str, detail: str) -> Record:
+def _record(shape: Shape, reason: str | None, detail: str = "") -> Record:
     detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
     return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
 
 
-def _prepared(source, left, preparation, folder, workers, progress) -> Iterator[tuple[Shape, Crashed | None]]:
+def _prepared(
+    source: Source, left: list[Shape], preparation: Preparation, folder: Path, workers: int | None
+) -> Iterator[tuple[Shape, bool]]:
+    """Each shape when it is prepared, and whether its worker died on it."""
     workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
-    function = _PrepareShape(source, preparation, folder)
-    if workers == 1:
-        results = ((index, function(shape)) for index, shape in enumerate(left))
-    else:
-        results = map_in_processes(function, left, workers)
-    quiet = None if progress else True  # None: no bar where nobody watches
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=quiet)
-    return ((left[index], result) for index, result in bar)
+    function = partial(prepare_shape, source, preparation, folder)
+    results = map_in_processes(function, left, workers) if workers > 1 else enumerate(map(function, left))
+    # disable=None: no bar where nobody watches
+    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
+    return ((left[index], isinstance(result, Crashed)) for index, result in bar)
 
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     """The shapes that are not in the store as they are now."""
-
-    def is_done(shape: Shape) -> bool:
-        kept = stored.get(shape.id)
-        return bool(kept and kept.fingerprint == shape.fingerprint and kept.record.reason not in TRIED_AGAIN)
-
-    return [shape for shape in shapes if not is_done(shape)]
+    fine = {id for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
+    return [s for s in shapes if s.id not in fine or stored[s.id].fingerprint != s.fingerprint]
 
 
 def _file(folder: Path, id: str) -> Path:
@@ -270,15 +196,7 @@ def _file(folder: Path, id: str) -> Path:
     return folder / f"{id}{SUFFIX}"
 
 
-def _ids_in(folder: Path) -> list[str]:
-    files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
-    paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
-    return sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
-
-
-def _read(
-    folder: Path, ids: Iterable[str], up: Literal["y", "z"] = "z", level: int = logging.WARNING
-) -> dict[str, StoredShape]:
+def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -> dict[str, StoredShape]:
     """The stored shapes of some ids, in their order, without those that are missing or clearly damaged."""
     paths = {id: _file(folder, id) for id in ids}
     for parent in {path.parent for path in paths.values()}:
@@ -296,43 +214,36 @@ def _read(
 
 
 def _checked(
-    folder: Path, shapes: list[Shape], source: Source, level: int = logging.DEBUG
+    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, quiet: bool = False
 ) -> dict[str, StoredShape]:
-    """The stored shapes whose files are intact, by id; damage is logged at `level`."""
+    """The stored shapes whose files are intact, by id; damage is logged.
+
+    The index notes which files are intact, and for a reader what the store was made of.
+    """
+    level = logging.DEBUG if quiet else logging.WARNING
     stored = _read(folder, [shape.id for shape in shapes], source.up, level)
-    known = _index(folder).get("checked", {})
-    changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
+    try:
+        known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]
+        changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        known, changed = {}, dict(stored)
     with ThreadPoolExecutor() as pool:  # hashing lets other threads run
         intact = dict(zip(changed, pool.map(StoredShape.is_intact, changed.values()), strict=True))
     for id in [id for id, is_intact in intact.items() if not is_intact]:
         log.log(level, "store: %s: damaged (checksum): to be prepared again", stored.pop(id).path)
-    _remember(folder, {id: stored[id] for id in changed if id in stored})
-    return stored
-
-
-def _index(folder: Path) -> dict:
-    try:
-        index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
-        return index if isinstance(index["checked"], dict) else {}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return {}
-
-
-def _remember(folder: Path, intact: dict[str, StoredShape], about: dict | None = None) -> None:
-    """Notes that files are intact, and for a reader what the store was made of."""
-    if intact:
-        index = _index(folder)
-        states = {id: shape.state for id, shape in intact.items()}
-        checked = dict(sorted((index.get("checked", {}) | states).items()))
-        index = {"about": about or index.get("about"), "checked": checked}
+    states = {id: stored[id].state for id in changed if id in stored}
+    if states:
+        about = {"source": source.name} | asdict(preparation)
+        index = {"about": about, "checked": dict(sorted((known | states).items()))}
         with suppress(OSError):  # a store that others own is read all the same
-            write_whole(folder / INDEX, json.dumps(index, indent=1))
+            write_whole(folder / INDEX, json.dumps(index, indent=1, default=describe))
+    return stored
 
 
 def _remove_leftovers(folder: Path) -> None:
     """Removes the half-written files of runs that were killed more than an hour ago."""
     for path, _, names in os.walk(folder):
-        for leftover in (Path(path, name) for name in names if _LEFTOVER.fullmatch(name)):
+        for leftover in (Path(path, name) for name in names if re.fullmatch(r"\..+\.[0-9a-f]{12}", name)):
             if time.time() - leftover.lstat().st_mtime > 3600:
                 leftover.unlink(missing_ok=True)
 

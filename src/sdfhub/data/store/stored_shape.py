@@ -9,22 +9,22 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
-from typing import Annotated, BinaryIO, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import ConfigDict, PositiveFloat, TypeAdapter
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, InFrame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
 
+# position, (x, y, z, sdf) twice, (point, normal), vertex indices: in their order in a file, so that all are
+# aligned the one of 8 bytes a number first
 COLUMNS = {"vertices": 3, "outside": 4, "inside": 4, "surface": 6, "faces": 3}
-"""Columns of each array, in their order in a file: position, (x, y, z, sdf) twice, (point, normal), vertex
-indices. The one of 8 bytes a number comes first, so that all are aligned."""
-
 DTYPES = {"vertices": "<f8", "outside": "<f4", "inside": "<f4", "surface": "<f4", "faces": "<i4"}
 _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
@@ -32,31 +32,20 @@ _MAX_HEADER = 1 << 20
 
 @dataclass(frozen=True)
 class Record:
-    """What is known of a prepared or rejected shape.
-
-    Args:
-        fingerprint, category, credits: as the source gave them.
-        seconds: what loading and preparing took.
-        center: source units; `source = normalised / scale + center`.
-        scale: normalised units per source unit.
-        statistics: plain numbers about the preparation.
-        reason: why the shape was rejected; None where it was not.
-        detail: of the rejection.
-        sha256: of all else in the file.
-    """
+    """What is known of a prepared or rejected shape."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
-    fingerprint: str
+    fingerprint: str  # this and the next two as the source gave them
     category: str
     credits: dict[str, str]
-    seconds: float = 0.0
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: Annotated[float, Field(gt=0)] = 1.0
-    statistics: dict[str, float] = field(default_factory=dict)
-    reason: str | None = None
-    detail: str = ""
-    sha256: str = ""
+    seconds: float = 0.0  # that loading and preparing took
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its frame
+    scale: PositiveFloat = 1.0
+    statistics: dict[str, float] = field(default_factory=dict)  # about the preparation
+    reason: str | None = None  # why the shape was rejected; None where it was not
+    detail: str = ""  # of the rejection
+    sha256: str = ""  # of all else in the file
 
 
 _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
@@ -64,28 +53,18 @@ _RECORD: TypeAdapter[Record] = TypeAdapter(Record)
 
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
     """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
-    rng = np.random.default_rng(seed)
+    rng, inside = np.random.default_rng(seed), samples.sdf < 0
     rows = np.column_stack([samples.points, samples.sdf])
+    arrays = {"outside": rng.permutation(rows[~inside]), "inside": rng.permutation(rows[inside])}
     surface = np.column_stack([samples.surface_points, samples.surface_normals])
-    inside = samples.sdf < 0
-    arrays = {
-        "outside": rng.permutation(rows[~inside]),
-        "inside": rng.permutation(rows[inside]),
-        "surface": rng.permutation(surface),
-    }
+    arrays["surface"] = rng.permutation(surface)
     if samples.mesh is not None:
         arrays |= {"vertices": samples.mesh.vertices, "faces": samples.mesh.faces}
     return {name: np.ascontiguousarray(array, dtype=DTYPES[name]) for name, array in arrays.items()}
 
 
 def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) -> None:
-    """Writes one shape's file.
-
-    Args:
-        path: what lies there is replaced.
-        arrays: as `arrays_of` makes them; empty for a rejected shape.
-        record: its `sha256` is filled in.
-    """
+    """Writes one shape's file: its record, and arrays as `arrays_of` makes them, none if rejected."""
     arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
     header = _header({name: len(array) for name, array in arrays.items()})
     digest = _digest(record, header)
@@ -117,7 +96,7 @@ def _digest(record: Record, header: Mapping[str, dict]) -> "hashlib._Hash":
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode())
 
 
-class StoredShape:
+class StoredShape(InFrame):
     """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
     Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
@@ -130,8 +109,6 @@ class StoredShape:
 
     Attributes:
         record: all that is known of the shape; `record.reason` is set where it was rejected.
-        center: [3] float64, source units; `source = normalised / scale + center`.
-        scale: normalised units per source unit.
         state: changes when the file is written anew.
 
     Raises:
@@ -143,29 +120,29 @@ class StoredShape:
         self.id, self.path, self.up = id, path, up
         with self._open() as file:
             status = os.fstat(file.fileno())
-            self.state = f"{status.st_size} {status.st_mtime_ns}"
             length = int.from_bytes(file.read(8), "little")
             if length > min(status.st_size, _MAX_HEADER):
                 raise ValueError("its header is damaged")
             text = file.read(length)
         try:
-            found = json.loads(text)
-            self.record = _RECORD.validate_json(found.pop("__metadata__")["record"])
-            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in found.items()}
-            header = _header(self._rows)
-            is_ours = found == header and all(type(rows) is int and rows >= 0 for rows in self._rows.values())
+            header = json.loads(text)
+            self.record = _RECORD.validate_json(header.pop("__metadata__")["record"])
+            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in header.items()}
+            is_ours = header == _header(self._rows)
+            is_ours &= all(type(rows) is int and rows >= 0 for rows in self._rows.values())
         except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
             raise ValueError(f"its header is damaged: {error!r}") from error
         if not is_ours:
             raise ValueError("its header is damaged")
-        self._start, self._size = 8 + length, status.st_size
+        self.state, self._size = f"{status.st_size} {status.st_mtime_ns}", status.st_size
+        self._start = 8 + length
         self._offsets = {name: self._start + entry["data_offsets"][0] for name, entry in header.items()}
         size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
         if size != self._size:
             raise ValueError(f"it has {self._size} bytes, not {size}")
-        self.category, self.fingerprint = self.record.category, self.record.fingerprint
-        self.credits, self.scale = self.record.credits, self.record.scale
-        self.center = np.array(self.record.center, dtype=np.float64)
+        self.category, self.credits = self.record.category, self.record.credits
+        self.fingerprint = self.record.fingerprint
+        self.frame = Frame(np.array(self.record.center, dtype=np.float64), self.record.scale)
 
     @property
     def outside(self) -> np.ndarray:
@@ -188,7 +165,7 @@ class StoredShape:
         if "faces" not in self._rows:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
-        return NormalizedMesh(vertices, faces, Frame(self.center, self.scale))
+        return NormalizedMesh(vertices, faces, self.frame)
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
@@ -226,7 +203,7 @@ class StoredShape:
         except OSError:
             return False
 
-    def _open(self) -> BinaryIO:
+    def _open(self) -> BufferedReader:
         return open(self.path, "rb", opener=_without_links)
 
     def _map(self, name: str) -> np.ndarray:
@@ -240,7 +217,7 @@ class StoredShape:
         except (OSError, ValueError) as error:
             raise self._broken(error) from error
 
-    def _refuse_other_size(self, file: BinaryIO) -> None:
+    def _refuse_other_size(self, file: BufferedReader) -> None:
         if (size := os.fstat(file.fileno()).st_size) != self._size:
             raise ValueError(f"it has {size} bytes, not {self._size}")
 

@@ -25,11 +25,6 @@ TOGETHER = {"cpu": 2**13, "cuda": 2**18}
 LEAST = 2**10
 """Samples that are worth a thread of their own."""
 
-_NO_TWIN = (
-    "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, and "
-    "tiny-cuda-nn built for it; null takes it where it is there"
-)
-
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
 
 
@@ -42,11 +37,10 @@ class Computing:
             memory.
         compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
             None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
-        tinycudann: whether tiny-cuda-nn computes a hash encoding, with the same table and result but for
-            rounding: it adds up a table's gradient in any order. None: on a GPU, where it is installed and
-            agrees, and no deterministic algorithms are asked for.
+        tinycudann: whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order.
+            None: on a GPU, where it is installed and agrees, unless deterministic algorithms are asked for.
         matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
-            (TF32) on a GPU, else `highest`. `medium` uses bfloat16 units, which some processors have too.
+            (TF32) on a GPU, else `highest`.
     """
 
     points_at_once: PositiveInt | None = None
@@ -68,34 +62,22 @@ class Computing:
         torch.set_float32_matmul_precision(self.matmul or ("highest" if device.type == "cpu" else "high"))
         keep_freed_memory()
 
-    @staticmethod
-    def put_back() -> None:
-        """Products are exact again, as PyTorch begins: what is trained is judged with all its digits."""
-        torch.set_float32_matmul_precision("highest")
-
     def quickest(self, encoding: Encoding, device: torch.device) -> Encoding:
         """The encoding, or its twin by tiny-cuda-nn.
 
         Raises:
             SdfhubError: the twin was asked for, and there is none here that agrees.
         """
-        self.refuse_impossible(encoding, device)
-        exact = self.tinycudann is None and torch.are_deterministic_algorithms_enabled()
-        if self.tinycudann is False or exact or not can_fuse(encoding, device):
-            return encoding
-        twin = fused(encoding)
+        wanted = self.tinycudann or (
+            self.tinycudann is None and not torch.are_deterministic_algorithms_enabled()
+        )
+        twin = fused(encoding) if wanted and can_fuse(encoding, device) else encoding
         if self.tinycudann and twin is encoding:
-            raise SdfhubError(_NO_TWIN)
+            raise SdfhubError(
+                "computing.tinycudann=true: needs encoding=hash with 1, 2, 4 or 8 features a level, a GPU, "
+                "and tiny-cuda-nn built for it; null takes it where it is there"
+            )
         return twin
-
-    def refuse_impossible(self, encoding: Encoding, device: torch.device) -> None:
-        """Refuses to train by what is not there, before anything is prepared.
-
-        Raises:
-            SdfhubError: tiny-cuda-nn was asked for, where it cannot be.
-        """
-        if self.tinycudann and not can_fuse(encoding, device):
-            raise SdfhubError(_NO_TWIN)
 
     def compiled(self, *functions: Callable, device: torch.device) -> tuple[Callable, ...]:
         """The functions themselves, or what `torch.compile` makes of them on this device.
@@ -104,27 +86,18 @@ class Computing:
         """
         if not (can_compile(device) if self.compile is None else self.compile):
             return functions
+        import torch._dynamo.config as dynamo  # here: it imports the compiler
+
         torch.compiler.reset()
-        fast = tuple(torch.compile(function) for function in functions)
-        return fast if self.compile else tuple(map(plain_if_broken, fast))
+        # unless it was asked for, what does not compile runs as it is; the backward pass has to be compiled
+        # with the forward one for that
+        dynamo.suppress_errors = aot.force_non_lazy_backward_lowering = self.compile is None
+        return tuple(torch.compile(function) for function in functions)
 
 
 def can_compile(device: torch.device) -> bool:
-    """Whether what `torch.compile` needs beside PyTorch for a GPU is there."""
-    tools = shutil.which(os.environ.get("CC", "cc")) and find_spec("triton")
-    return device.type == "cuda" and bool(tools)
-
-
-def plain_if_broken(fast: Callable) -> Callable:
-    """A compiled function that PyTorch runs as it is, with a warning, where it does not compile."""
-    import torch._dynamo.config as dynamo  # here: it imports the compiler
-
-    def call(*arguments):
-        # the backward pass is compiled with the forward one: later, nobody could go on without it
-        with aot.patch(force_non_lazy_backward_lowering=True), dynamo.patch(suppress_errors=True):
-            return fast(*arguments)
-
-    return call
+    """Whether it is a GPU, and what `torch.compile` needs for it beside PyTorch is there."""
+    return device.type == "cuda" and bool(shutil.which(os.environ.get("CC", "cc")) and find_spec("triton"))
 
 
 def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
@@ -142,14 +115,10 @@ def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
 
 
 def keep_freed_memory() -> None:
-    """Lets this process keep blocks it has freed, up to a GiB, where the C library is glibc.
+    """Lets this process keep up to a GiB of what it has freed, for all its threads, where there is glibc.
 
-    It would give the layers' outputs back to the system and fetch them again, zeroed, at every step. Threads
-    share what is kept, or each would have its own.
+    Else the layers' outputs go back to the system and are fetched again, zeroed, at every step.
     """
-    try:
-        set_option = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # another C library
-        return
-    for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
-        set_option(option, value)
+    if set_option := getattr(ctypes.CDLL(None) if os.name == "posix" else None, "mallopt", None):
+        for option, value in ((_TRIM_THRESHOLD, 2**30), (_MMAP_THRESHOLD, 2**30), (_ARENA_MAX, 1)):
+            set_option(option, value)

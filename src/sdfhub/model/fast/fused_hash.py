@@ -1,20 +1,22 @@
 """The hash encoding by tiny-cuda-nn, where that is installed: one kernel a level and direction, on a GPU.
 
-It is the function of `Hash` and reads its very table, so that a checkpoint does not know which of them
-trained it. Each level is a grid of its own, because tiny-cuda-nn ties the resolutions of a grid's levels.
+It reads the table of `Hash`: a checkpoint does not know which of them trained it. Each level is a grid of its
+own, because tiny-cuda-nn ties the resolutions of a grid's levels.
 
-Source: https://github.com/NVlabs/tiny-cuda-nn, `GridEncoding` with a single level. Compared with `Hash` it
-reads places in [0, 1] and half a cell further, counts vertices where we count cells, lets the first axis of a
-directly indexed grid vary fastest, and holds a multiple of eight rows.
+Source: https://github.com/NVlabs/tiny-cuda-nn, `GridEncoding`. Compared with `Hash` it reads places in [0, 1]
+and half a cell further, counts vertices where we count cells, lets the first axis of a directly indexed grid
+vary fastest, and holds a multiple of eight rows.
 """
 
 import warnings
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from typing import TypeGuard
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 
 from sdfhub.model.encodings import Encoding, Hash
@@ -26,51 +28,37 @@ PROBES, TOLERANCE = 4096, 1e-3
 
 
 class FusedHash(Encoding):
-    """The same features as those of a `Hash`, from the same table.
-
-    Args:
-        plain: the encoding to compute, whose table this one shares.
-    """
+    """The same features as those of the encoding `plain`, from the same table."""
 
     def __init__(self, plain: Hash):
         super().__init__()
-        self.features, self.width = plain.features, plain.width
-        self.include_points, self.rows, self.dense = plain.include_points, plain.rows, plain.dense
-        self.cells: list[int] = plain.cells.tolist()
-        self.table = plain.table
+        self.features, self.table = plain.features, plain.table
+        config = {"otype": "Grid", "type": "Hash", "interpolation": "Smoothstep", "n_levels": 1}
+        config |= {"n_features_per_level": plain.width, "per_level_scale": 1.0}
+        config |= {"log2_hashmap_size": (max(plain.rows) - 1).bit_length()}
+        make = partial(import_module("tinycudann").Encoding, 3, dtype=torch.float32)
         # in lists, so that neither the grids' own tables nor the twin's become weights of this module
-        self._plain, self._grids = [plain], [self._grid(cells) for cells in self.cells]
+        self._plain, self._cells = [plain], [int(cells) for cells in plain.cells]
+        self._grids = [make(config | {"base_resolution": cells + 1}) for cells in self._cells]
 
-    def _grid(self, cells: int) -> nn.Module:
-        config = {
-            "otype": "Grid",
-            "type": "Hash",
-            "n_levels": 1,
-            "n_features_per_level": self.width,
-            "log2_hashmap_size": (max(self.rows) - 1).bit_length(),
-            "base_resolution": cells + 1,
-            "per_level_scale": 1.0,
-            "interpolation": "Smoothstep",
-        }
-        return import_module("tinycudann").Encoding(3, config, dtype=torch.float32)
-
-    def plain(self) -> Encoding:
+    def plain(self) -> Hash:
         return self._plain[0]
 
     @torch.compiler.disable
     def forward(self, points: Tensor) -> Tensor:
-        places = (points.flatten(0, -2) + 1) / 2
-        tables = self.table.split(self.rows)
-        features = [points.flatten(0, -2)] if self.include_points else []
-        for level, (grid, cells, rows) in enumerate(zip(self._grids, self.cells, tables, strict=True)):
+        plain, places = self._plain[0], (points.flatten(0, -2) + 1) / 2
+        tables = self.table.split(plain.rows)
+        features = [points.flatten(0, -2)] if plain.include_points else []
+        for level, (grid, cells, rows) in enumerate(zip(self._grids, self._cells, tables, strict=True)):
             # a hash knows no border; a grid that is indexed directly goes on with its last value
-            inside = places.clamp(0, 1).flip(-1) if level < self.dense else places
-            padded = F.pad(rows.flatten(), (0, -len(rows) % 8 * self.width * (level < self.dense)))
+            indexed = level < plain.dense
+            inside = places.clamp(0, 1).flip(-1) if indexed else places
+            padded = F.pad(rows.flatten(), (0, -len(rows) % 8 * plain.width * indexed))
             features.append(functional_call(grid, {"params": padded}, (inside - 0.5 / cells,)))
         return torch.cat(features, dim=-1).unflatten(0, points.shape[:-1])
 
 
-def can_fuse(encoding: Encoding, device: torch.device) -> bool:
+def can_fuse(encoding: Encoding, device: torch.device) -> TypeGuard[Hash]:
     """Whether there could be a twin on this device."""
     fits = isinstance(encoding, Hash) and encoding.width in WIDTHS and device.type == "cuda"
     return fits and find_spec("tinycudann") is not None
@@ -81,13 +69,12 @@ def fused(plain: Hash) -> Encoding:
     try:
         twin = FusedHash(plain)
         difference = disagreement(twin, plain)
+        if difference <= TOLERANCE:
+            return twin
+        reason = f"its grid differs by {difference:.1e}"
     except Exception as error:  # whatever a library made for another GPU raises
         reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
-        warnings.warn(f"tinycudann: goes on without, {reason}", stacklevel=2)
-        return plain
-    if difference <= TOLERANCE:
-        return twin
-    warnings.warn(f"tinycudann: goes on without, its grid differs by {difference:.1e}", stacklevel=2)
+    warnings.warn(f"tinycudann: goes on without, {reason}", stacklevel=2)
     return plain
 
 
@@ -97,13 +84,13 @@ def disagreement(twin: Encoding, plain: Hash) -> float:
     points = (torch.rand(1, PROBES, 3, generator=generator) * 2.2 - 1.1).to(plain.table)
     cotangent = torch.randn(1, PROBES, plain.features, generator=generator).to(plain.table)
     cotangent[..., : 3 * plain.include_points] = 0  # the coordinates themselves would hide the table
-    found = []
+    results = []
     for encoding in (twin, plain):
         with torch.enable_grad():
             features, pullback = encoding.with_pullback(points)
             slopes = pullback(cotangent)
             learned = (features * cotangent).sum() + slopes.square().sum() / slopes.detach().norm()
             by_table = torch.autograd.grad(learned, plain.table)[0]
-        found.append([(features * cotangent).detach(), slopes.detach(), by_table])
-    ratios = [(one - other).norm() / other.norm() for one, other in zip(*found, strict=True)]
+        results.append([(features * cotangent).detach(), slopes.detach(), by_table])
+    ratios = [(have - want).norm() / want.norm() for have, want in zip(*results, strict=True)]
     return float(torch.stack(ratios).nan_to_num(torch.inf).max())

@@ -1,8 +1,6 @@
 """A large batch in pieces: the gradient of the whole in the memory of a part, on all cores.
 
-DeepSDF's paper batch is a million points; the activations of all of them at once would take tens of
-gigabytes, and on a CPU even a few thousand leave its caches. A core that works on pieces of its own waits for
-no other.
+At once the activations of DeepSDF's batch, a million points, would take tens of gigabytes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,9 +20,7 @@ Parts = dict[str, Tensor]
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
     """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals.
 
-    Args:
-        batch: [B, N] samples, [B, M] surface points.
-        points: whole shapes together where several fit, else parts of one shape, >= 1.
+    They are of several whole shapes where those fit, else parts of one shape.
     """
     shapes, samples = batch.sdf.shape
     surface = max(1, batch.surface_points.shape[1])
@@ -45,17 +41,18 @@ def loss_in_pieces(
     parameters: Sequence[nn.Parameter],
     threads: int = 1,
 ) -> tuple[Tensor, Parts]:
-    """The loss of a batch and its parts, each a mean over samples, normals or shapes; differentiable.
+    """The loss of a batch and its parts; the plain twin is `parts_of(batch)`.
 
     A batch of more than `points` samples is differentiated in here, piece by piece; `backward` only has to
-    hand the sum over. The plain twin is `parts_of(batch)`.
+    hand the sum over.
 
     Args:
-        parts_of: the weighted parts of a batch; a part named `normal` is a mean over surface points.
+        parts_of: the weighted parts of a batch: means over surface points for one named `normal`, else over
+            samples or shapes. Called from all threads.
         batch: to be split.
         points: samples that are worked on together, >= 1.
         parameters: what the loss is differentiated by.
-        threads: each differentiates pieces of its own, >= 1; `parts_of` is called from all of them.
+        threads: each differentiates pieces of its own, >= 1.
     """
     if batch.sdf.numel() <= points:
         parts = parts_of(batch)
@@ -67,9 +64,8 @@ def loss_in_pieces(
         return {name: part * (of_normals if name == "normal" else of_samples) for name, part in parts.items()}
 
     cut = list(pieces(batch, points))
-    seeds = [None] * len(cut)
-    if batch.sdf.is_cpu:  # drawn here, in order: threads take turns as they like
-        seeds = torch.randint(2**63 - 1, (len(cut),)).tolist()
+    # drawn here, in order: threads take turns as they like
+    seeds = torch.randint(2**63 - 1, (len(cut),)).tolist() if batch.sdf.is_cpu else [None] * len(cut)
     calls = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
     shares = [share for thread in range(threads) if (share := calls[thread::threads])]
     totals: Parts = {}
@@ -83,13 +79,12 @@ class _Summed(torch.autograd.Function):
     def forward(
         ctx, shares: Sequence[Sequence[Callable[[], Parts]]], totals: Parts, *parameters: Tensor
     ) -> Tensor:
-        (sums, ctx.gradients), *others = side_by_side(
-            lambda share: _differentiated(share, parameters), shares
-        )
-        totals.update(sums)
-        for sums, gradients in others:
+        sums = side_by_side(lambda share: _differentiated(share, parameters), shares)
+        (parts, ctx.gradients), *rest = sums
+        totals.update(parts)
+        for parts, gradients in rest:
             torch._foreach_add_(ctx.gradients, gradients)
-            for name, part in sums.items():
+            for name, part in parts.items():
                 totals[name] = totals[name] + part
         return torch.stack(tuple(totals.values())).sum()
 
@@ -103,17 +98,13 @@ def _differentiated(
 ) -> tuple[Parts, list[Tensor]]:
     """Sums of the parts of the loss over pieces, and its gradient, one piece after the other."""
     totals: Parts = {}
-    gradients: list[Tensor] = []
+    gradients = [torch.zeros_like(parameter) for parameter in parameters]
     for parts_of_piece in share:
         with torch.enable_grad():
             parts = parts_of_piece()
             loss = torch.stack(tuple(parts.values())).sum()
         with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
-            by_piece = torch.autograd.grad(loss, parameters, materialize_grads=True)
-        if gradients:
-            torch._foreach_add_(gradients, by_piece)
-        else:
-            gradients = list(by_piece)
+            torch._foreach_add_(gradients, torch.autograd.grad(loss, parameters, materialize_grads=True))
         for name, part in parts.items():
-            totals[name] = totals.get(name, 0) + part.detach()
+            totals[name] = totals.get(name, torch.zeros_like(part)) + part.detach()
     return totals, gradients

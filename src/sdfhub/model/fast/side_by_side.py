@@ -1,7 +1,7 @@
 """Parts of a computation that need nothing of one another, side by side on the cores of a processor.
 
 PyTorch spreads every operation over its threads, which wait for one another after each: hundreds of times in
-a training step. Whole parts wait once, at the end. Each is computed by one thread alone.
+a training step. Whole parts, each computed by one thread alone, wait once, at the end.
 """
 
 import os
@@ -13,11 +13,12 @@ from typing import TypeVar
 
 import torch
 
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _FIRST = Lock()
-"""Threads call the functions of MKL's vector library for the first time in turn: of two that did so at once,
-one had sines good to a ten-thousandth, once in some hundred processes."""
+"""Threads call MKL's vector functions for the first time in turn: of two that did so at once, one had sines
+good to a ten-thousandth, once in some hundred processes."""
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: int = 2) -> list[Result]:
@@ -33,13 +34,19 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: i
             a result does not depend, not even by rounding, on how many items there are.
 
     Raises:
-        whatever the first item to fail raises; those not begun are left out. When this returns or raises,
-            no thread is at work.
+        whatever the first item to fail raises; no thread is then at work, and those not begun are left out.
     """
     threads = torch.get_num_threads()
     if threads < 2 or len(items) < least:
         return [work(item) for item in items]
-    call, pool = _in_modes_of_caller(work), _pool(threads)
+    grads, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    autocast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
+
+    def call(item: Item) -> Result:  # threads do not inherit the modes of the caller
+        with torch.inference_mode(inference), torch.set_grad_enabled(grads), torch.autocast("cpu", *autocast):
+            return work(item)
+
+    pool = _pool(threads)
     futures = [pool.submit(call, item) for item in items]
     try:
         wait(futures, return_when=FIRST_EXCEPTION)
@@ -49,22 +56,6 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: i
         wait(futures)
     failed = [future for future in futures if not future.cancelled() and future.exception()]
     return [future.result() for future in failed or futures]
-
-
-def _in_modes_of_caller(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """`work` in the modes of the calling thread: threads do not inherit them."""
-    gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
-    dtype, autocast = torch.get_autocast_dtype("cpu"), torch.is_autocast_enabled("cpu")
-
-    def call(item: Item) -> Result:
-        with (
-            torch.inference_mode(inference),
-            torch.set_grad_enabled(gradients),
-            torch.autocast("cpu", dtype, enabled=autocast),
-        ):
-            return work(item)
-
-    return call
 
 
 @cache

@@ -1,17 +1,17 @@
 """sin(omega x) and tanh(beta sin(omega x)) in float32 on the CPU: one pass over memory forward, one backward.
 
-As tensor operations an activation and its gradient are some thirty passes, which cost as much as the matrix
-products between them. numba compiles each loop when it is first used (seconds) and keeps it on disk.
+As tensor operations an activation and its gradient are some thirty passes. numba compiles the loops when they
+are first used (seconds) and keeps them on disk. Backward recomputes from the product: nothing else is kept.
 
-Backward recomputes from the product: nothing else is kept. Sines are polynomials fitted by least squares at
-Chebyshev nodes, errors below 1e-6 for angles omega x up to 2e6; beyond 2e7, where float32 numbers lie a
-radian and more apart, sines and the slopes of HOSC are not even bounded. A hyperbolic tangent is a ratio of
-two polynomials with the least largest error, and 1 from 9 on: an approximation that kept away from 1 would
+Sines are polynomials fitted by least squares at Chebyshev nodes, errors below 1e-6 for angles omega x up to
+2e6; beyond 2e7, where float32 numbers lie a radian apart, nothing is bounded. A hyperbolic tangent is a ratio
+of two polynomials with the least largest error, and 1 from 9 on: an approximation that kept away from 1 would
 have slopes where HOSC is flat.
 """
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import TypeGuard
 
 import numba
 import numpy as np
@@ -31,98 +31,73 @@ ALONE = 2**17
 FAST = {"contract", "nsz", "arcp"}
 """What a compiler may change. Without "nnan" a diverged training shows; "reassoc" would undo careful sums."""
 
-_loop = numba.njit(
-    nogil=True, fastmath=FAST, error_model="numpy", cache=True
-)  # Python's checks each division
+_loop = numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)  # Python's checks divisions
 _inlined = numba.njit(inline="always", fastmath=FAST)
 
 _features = binding.get_host_cpu_features()
-if _features.get("avx512f") and not numba.config.CPU_FEATURES:
+if _features.get("avx512f") and not numba.config.CPU_FEATURES:  # type: ignore[attr-defined]
     _features["prefer-256-bit"] = False  # LLVM shuns the widest registers; matrix products use them anyway
-    numba.config.CPU_NAME, numba.config.CPU_FEATURES = binding.get_host_cpu_name(), _features.flatten()
+    numba.config.CPU_NAME = binding.get_host_cpu_name()  # type: ignore[attr-defined]
+    numba.config.CPU_FEATURES = _features.flatten()  # type: ignore[attr-defined]
 
 _f = np.float32
 _PI, _PI_REST = _f(np.pi), _f(np.pi - np.float64(_f(np.pi)))
 
 
-def fits(activation: Activation, product: Tensor) -> bool:
-    """Whether the loops compute this activation of this product: a sine or HOSC, in float32 on the CPU."""
+def fits(activation: Activation, product: Tensor, shift: Tensor) -> TypeGuard[Siren]:
+    """Whether the loops compute a(product + shift): a sine or HOSC, in float32 on the CPU."""
     return (
         type(activation) in (Siren, Hosc)  # a subclass may be another function
         and product.is_cpu
         and product.dtype == torch.float32
         and product.numel() > 0
+        and shift.shape in (product.shape[2:], (product.shape[0], 1, product.shape[2]))
         and not torch.compiler.is_compiling()
         and not torch.is_autocast_enabled("cpu")
     )
 
 
-def wave(
-    activation: Siren, product: Tensor, shift: Tensor, beside: Tensor | None, sloped: bool
-) -> tuple[Tensor, Tensor | None]:
-    """[a(product + shift) | beside] and a', as `activated` in decoder.py, where the activation `fits`.
-
-    Raises:
-        ValueError: shapes do not fit; a loop would read beyond an array's end.
-    """
-    shapes, _, width = product.shape
-    if shift.shape not in ((width,), (shapes, 1, width)):
-        raise ValueError(f"a shift {list(shift.shape)} does not fit products {list(product.shape)}")
-    if beside is not None and beside.shape[:2] != product.shape[:2]:
-        raise ValueError(f"{list(beside.shape)} cannot stand beside products {list(product.shape)}")
-    log_beta = getattr(activation, "log_beta", None)
-    given = product, shift.float(), log_beta, None if beside is None else beside.to(product.dtype)
-    result = _Wave.apply(*given, activation.omega, activation.with_slope, sloped)
+def wave(activation: Siren, product: Tensor, shift: Tensor, sloped: bool) -> tuple[Tensor, Tensor | None]:
+    """a(product + shift) and a', as `activated` in decoder.py, where the activation `fits`."""
+    inputs = product, shift.float(), getattr(activation, "log_beta", None)
+    result = _Wave.apply(*inputs, activation.omega, activation.with_slope, sloped)
     return result if sloped else (result, None)
 
 
 class _Wave(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, product, shift, log_beta, beside, omega: float, plain: Callable, sloped: bool):
+    def forward(ctx, product, shift, log_beta, omega: float, plain: Callable, sloped: bool):
         ctx.omega, ctx.plain = omega, plain
         ctx.save_for_backward(product, shift, log_beta)
-        shapes, points, width = product.shape
-        value = product.new_empty(shapes, points, width + (0 if beside is None else beside.shape[2]))
-        slope = torch.empty_like(product, memory_format=torch.contiguous_format) if sloped else None
-        _run(
-            _forward,
-            product,
-            _given(omega, product, shift, log_beta),
-            _flat(beside),
-            _flat(value),
-            _flat(slope),
-        )
+        value = torch.empty_like(product, memory_format=torch.contiguous_format)
+        slope = torch.empty_like(value) if sloped else None
+        _run(_forward, product, shift, log_beta, omega, _flat(value), _flat(slope))
         return (value, slope) if sloped else value
 
     @staticmethod
     def backward(ctx, by_value, by_slope=None):
         product, shift, log_beta = ctx.saved_tensors
-        width = product.shape[2]
-        by_beside = by_value[..., width:] if ctx.needs_input_grad[3] else None
         if torch.is_grad_enabled():  # the gradient is to be differentiated again
-            return *_differentiable(ctx, by_value[..., :width], by_slope), by_beside, None, None, None
+            return *_differentiable(ctx, by_value, by_slope), None, None, None
+        width = product.shape[2]
         by_product = torch.empty_like(product, memory_format=torch.contiguous_format)
         by_shift, by_log_beta = torch.empty(2, _chunks(product), width)
-        results = _flat(by_product), by_shift.numpy(), by_log_beta.numpy()
-        given = _given(ctx.omega, product, shift, log_beta)
-        _run(_backward, product, given, _flat(by_value), _flat(by_slope), *results)
+        arrays = map(_flat, (by_value, by_slope, by_product, by_shift, by_log_beta))
+        _run(_backward, product, shift, log_beta, ctx.omega, *arrays)
         by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
-        by_log_beta = None if log_beta is None else by_log_beta.sum()
-        return by_product, by_shift, by_log_beta, by_beside, None, None, None
+        by_beta = None if log_beta is None else by_log_beta.sum()
+        return by_product, by_shift, by_beta, None, None, None
 
 
-def _differentiable(ctx, by_value: Tensor, by_slope: Tensor | None) -> list[Tensor | None]:
+def _differentiable(ctx, *cotangents: Tensor | None) -> list[Tensor | None]:
+    """The gradients of product, shift and log beta through the plain formula."""
     product, shift, _ = ctx.saved_tensors
-    pairs = zip(ctx.plain(product + shift), (by_value, by_slope), strict=True)
-    outputs, cotangents = zip(*[pair for pair in pairs if pair[1] is not None], strict=True)
-    wanted = [tensor for tensor in ctx.saved_tensors if tensor is not None and tensor.requires_grad]
-    gradients = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True))
-    return [next(gradients) if any(tensor is one for one in wanted) else None for tensor in ctx.saved_tensors]
-
-
-def _given(omega: float, product: Tensor, shift: Tensor, log_beta: Tensor | None) -> tuple:
-    beta = None if log_beta is None else _f(log_beta.exp().item())
-    return _flat(product), _flat(shift), product.shape[1], _f(omega), beta
+    pairs = zip(ctx.plain(product + shift), cotangents, strict=True)
+    outputs, given = zip(*(pair for pair in pairs if pair[1] is not None), strict=True)
+    needed = ctx.needs_input_grad[:3]
+    inputs = [tensor for tensor, need in zip(ctx.saved_tensors, needed, strict=True) if need]
+    gradients = iter(torch.autograd.grad(outputs, inputs, given, create_graph=True))
+    return [next(gradients) if need else None for need in needed]
 
 
 def _flat(tensor: Tensor | None) -> np.ndarray | None:
@@ -135,8 +110,12 @@ def _chunks(product: Tensor) -> int:
     return product.shape[0] * -(-product.shape[1] // ROWS)
 
 
-def _run(kernel: Callable, product: Tensor, given: tuple, *arrays) -> None:
+def _run(
+    kernel: Callable, product: Tensor, shift: Tensor, log_beta: Tensor | None, omega: float, *arrays
+) -> None:
     """Runs a loop over the chunks of a product, on as many threads as PyTorch has."""
+    beta = None if log_beta is None else _f(log_beta.exp().item())
+    given = _flat(product), _flat(shift), product.shape[1], _f(omega), beta
     count, threads = _chunks(product), torch.get_num_threads() if product.numel() > ALONE else 1
     ends = [count * part // threads for part in range(threads + 1)]
     side_by_side(lambda chunks: kernel(*chunks, *given, *arrays), list(pairwise(ends)))
@@ -174,7 +153,7 @@ def _rows(chunk, points):
 
 
 @_loop
-def _forward(first, end, product, shift, points, omega, beta, beside, value, slope):
+def _forward(first, end, product, shift, points, omega, beta, value, slope):
     for chunk in range(first, end):
         shape, low, high = _rows(chunk, points)
         line = shape if len(shift) > 1 else 0
@@ -188,9 +167,6 @@ def _forward(first, end, product, shift, points, omega, beta, beside, value, slo
                 value[p, j] = a
                 if slope is not None:
                     slope[p, j] = d
-            if beside is not None:
-                for j in range(beside.shape[1]):
-                    value[p, product.shape[1] + j] = beside[p, j]
 
 
 @_loop
