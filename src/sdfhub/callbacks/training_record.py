@@ -31,13 +31,8 @@ class TrainingRecord(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, *_: Any) -> None:
         if not self.stepped:
-            self.stepped = True
-            self.start_clock()
+            self.stepped, self._started = True, time.perf_counter()
         self._losses.append(outputs["loss"])
-
-    def start_clock(self) -> None:
-        """Counts seconds from now on."""
-        self._started = time.perf_counter()
 
     def stop_clock(self) -> bool:
         """Counts no seconds from now on; returns whether it did before."""
@@ -49,8 +44,7 @@ class TrainingRecord(L.Callback):
         self.stop_clock()
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
-        if self.stepped:
-            self.start_clock()
+        self._started = time.perf_counter() if self.stepped else None
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         self.stop_clock()
@@ -83,4 +77,4 @@ def clock_stopped(trainer: L.Trainer) -> Iterator[None]:
     was_running = [record for record in records if record.stop_clock()]
     yield
     for record in was_running:
-        record.start_clock()
+        record._started = time.perf_counter()

@@ -54,7 +54,7 @@ class Row:
 
     @property
     def searched(self) -> str:
-        """What search the settings come from, as the experiment's config says: `no` where it says nothing."""
+        """What search the settings come from, as the experiment's config says."""
         return str(self.first.result.config.get("searched") or "no")[:200] if self.first else NONE
 
 
@@ -103,11 +103,7 @@ class Group:
 
     @cached_property
     def statistics(self) -> pd.DataFrame:
-        """Means over seeds, by label and role: `cd_mean`, `excess_median`, ..., `no_surface`, `shapes`.
-
-        Beside each column `_ci95`, the half width of its 95% interval (Student's t; none for one seed), and
-        `_seeds`, how many seeds it is the mean of.
-        """
+        """Means over seeds, by label and role: `cd_mean`, `excess_median`, ..., `no_surface`, `shapes`."""
         cells = self.shapes.groupby(["label", "role", "cell"], sort=False)
         frame = cells[[name for name in MEASURES if name != "no_surface"]].agg(["mean", "median"])
         frame.columns = pd.Index(["_".join(names) for names in frame.columns])
@@ -123,7 +119,7 @@ class Group:
 
 
 def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """The mean of each column over the lines of equal `by`, the half width of its 95% interval, its count."""
+    """Each column's mean over lines of equal `by`; `_ci95`: half its 95% interval (Student); `_seeds`: count."""
     seeds = cells.groupby(by, sort=False)
     count = seeds.count()
     half_width = seeds.sem() * stats.t.ppf(0.975, count - 1)  # not a number for one seed

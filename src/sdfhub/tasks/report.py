@@ -34,13 +34,7 @@ MESH_BYTES = 4_000_000  # room for the meshes to turn on a page
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     """Writes tables (md, tex, csv), `shapes.csv`, a sheet a group and `report.html`; prints the tables.
 
-    Args:
-        sweep: folder of a multirun, finished or not.
-        out: folder of the report.
-        shapes: pictured side by side.
-
-    Returns:
-        The cells of the sweep.
+    Returns the cells of the sweep, finished or not, of which `shapes` shapes are pictured side by side.
 
     Raises:
         SdfhubError: not a sweep's folder.
@@ -75,7 +69,8 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
 
 def page(**content: Any) -> str:
     """A page that opens offline: text is escaped, and its policy lets no request out."""
-    style, script = (files("sdfhub.report").joinpath(n).read_text("utf-8") for n in ("page.css", "viewer.js"))
+    folder = files("sdfhub.report")
+    style, script = ((folder / name).read_text("utf-8") for name in ("page.css", "viewer.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     loader = PackageLoader("sdfhub.report", ".")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
