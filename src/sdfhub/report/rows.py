@@ -119,7 +119,7 @@ class Group:
 
 
 def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Each column's mean over lines of equal `by`; `_ci95`: half its 95% interval (Student); `_seeds`: count."""
+    """Each column's mean over lines of equal `by`; `_ci95`: half the 95% interval; `_seeds`: count."""
     seeds = cells.groupby(by, sort=False)
     count = seeds.count()
     half_width = seeds.sem() * stats.t.ppf(0.975, count - 1)  # not a number for one seed
