@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from sdfhub.geometry.surface_sampling import sample_surface
-from sdfhub.report.meshes import reconstruction
+from sdfhub.report.pictures import reconstruction
 from sdfhub.report.plan import PlannedCell
 from sdfhub.report.results import Cell, ShapeScore, read_scores
 from sdfhub.tasks.report import truth_finder

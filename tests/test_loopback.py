@@ -13,7 +13,7 @@ from websockets.http11 import Request
 from websockets.sync.client import connect
 
 from sdfhub.errors import SdfhubError
-from sdfhub.viewer.loopback import MAX_UPLOAD, PART, Gate, LoopbackServer, refusal
+from sdfhub.viewer.loopback import MAX_UPLOAD, PART, LoopbackServer, passed, refusal
 from tests.test_view import wait_until
 
 
@@ -99,7 +99,7 @@ def announced(raw: bytes) -> int:
     b"",
 ])  # fmt: skip
 def test_messages_that_the_page_does_not_need_do_not_pass(raw):
-    assert Gate((".ply",)).passed(raw) is None
+    assert passed(raw, (".ply",)) is None
 
 
 def test_values_and_the_camera_pass_as_they_are():
@@ -107,7 +107,7 @@ def test_values_and_the_camera_pass_as_they_are():
         packed(type="GuiUpdateMessage", uuid="a", updates={"value": 0.5}),
         packed(type="ViewerCameraMessage"),
     ):
-        assert Gate(()).passed(raw) == raw
+        assert passed(raw, ()) == raw
 
 
 @pytest.mark.parametrize("wrong", [
@@ -119,20 +119,12 @@ def test_values_and_the_camera_pass_as_they_are():
     start(size=0, parts=10**9),
 ])  # fmt: skip
 def test_an_upload_that_is_too_large_or_of_another_type_arrives_empty(wrong):
-    gate = Gate((".ply",))
-    assert announced(gate.passed(wrong)) == 0
-    assert gate.passed(part(0)) is None
+    assert announced(passed(wrong, (".ply",))) == 0
 
 
-def test_an_upload_takes_its_own_parts_once_and_one_goes_on_at_a_time():
-    gate = Gate((".ply",))
-    assert announced(gate.passed(start("A.PLY"))) == 2
-    assert gate.passed(part(0, content=b"x" * (PART + 1))) is None
-    assert gate.passed(part(0)) and gate.passed(part(0)) is None
-    assert gate.passed(part(2)) is None and gate.passed(part(1, uuid="other")) is None
-    assert announced(gate.passed(start(uuid="second"))) == 0
-    assert gate.passed(part(1))
-    assert announced(gate.passed(start(uuid="third"))) == 2
+def test_an_upload_passes_in_parts_of_bounded_size():
+    assert announced(passed(start("A.PLY"), (".ply",))) == 2
+    assert passed(part(0), ()) and passed(part(0, content=b"x" * (PART + 1)), ()) is None
 
 
 def get(server, path, host=None):

@@ -24,8 +24,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
 from sdfhub.report import pictures
 from sdfhub.report.charts import shape_chart
-from sdfhub.report.meshes import ShownMesh, packed, reconstruction
-from sdfhub.report.pictures import Gallery
+from sdfhub.report.pictures import ShownMesh, contact_sheets, packed, reconstruction
 from sdfhub.report.plan import PLAN, enter_cells, read_plan
 from sdfhub.report.results import ShapeScore, read_sweep
 from sdfhub.report.rows import group_cells, shapes_csv, table_csv
@@ -389,12 +388,6 @@ def test_augmented_copies_are_drawn_from_and_not_shapes(tmp_path):
     assert (costs["trained_on"], costs["samples"]) == (3, 50 * 9 * 256)
 
 
-def test_metrics_of_before_the_role_was_train_are_read(tmp_path):
-    path = write_cell(tmp_path, planned("SIREN"), [0.1e-3]) / "metrics.json"
-    path.write_text(path.read_text().replace('"train"', '"known"'))
-    assert list(read_sweep(tmp_path)[0].scores.shapes) == ["train"]
-
-
 def test_a_lock_is_held_once_and_freed(tmp_path):
     path = tmp_path / ".lock"
     with locked(path, patience=0) as first, locked(path, patience=0.2) as second:
@@ -467,15 +460,14 @@ def test_what_is_no_sweep_is_one_line_and_gets_no_folder(tmp_path):
 def test_scores_are_what_training_writes():
     from sdfhub.geometry.metrics import ShapeMetrics
 
-    assert set(ShapeScore.model_fields) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
-    assert set(score("x", 1.0)) - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
+    assert {*ShapeScore.model_fields, *score("x", 1.0)} - {"id"} <= set(ShapeMetrics.__dataclass_fields__)
 
 
 def test_truth_is_looked_up_where_the_cell_was_trained(tmp_path):
     """Two sources may give two shapes one id."""
     folders = [write_cell(tmp_path, planned(method), [0.1e-3]) for method in ("SIREN", "FFT/SIREN")]
     asked = []
-    Gallery(lambda cell, id: asked.append((cell.folder, id))).sheets([only_group(tmp_path)], 1)
+    contact_sheets([only_group(tmp_path)], 1, lambda cell, id: asked.append((cell.folder, id)))
     assert {folder for folder, _ in asked} == set(folders)
 
 

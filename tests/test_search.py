@@ -1,7 +1,5 @@
 """A search is a multirun that chooses its cells as it goes, within a budget that a restart does not renew."""
 
-from types import SimpleNamespace
-
 import pytest
 import yaml
 from omegaconf import OmegaConf
@@ -13,7 +11,6 @@ from tests.stand_in_training import CONF, of_multirun, stand_in
 from tests.sweep_folders import score
 
 pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
-from optuna.pruners import MedianPruner
 
 SEARCHES = sorted(path.stem for path in (CONF / "hparams_search").glob("*.yaml"))
 
@@ -79,23 +76,6 @@ def test_searches_under_other_settings_are_other_searches(search):
         assert search.start("hparams_search.trials=1", *words) == 0
     assert [config["seed"] for config in search.configs] == [0, 1], "each has its own budget"
     assert all(path.name.startswith("search_fft_hosc_procedural_chairs_demo_") for path in search.folders())
-
-
-def test_a_trial_that_is_worse_than_the_median_of_earlier_ones_is_pruned(search):
-    from sdfhub.multirun.pruning import Pruning
-
-    stopped = []
-
-    def validate(config, n) -> bool:
-        trainer = SimpleNamespace(should_stop=False, sanity_checking=False, global_step=10)
-        trainer.callback_metrics = {"val/cd": 5.0 if n == 3 else 1.0}
-        Pruning(pruner=MedianPruner(n_startup_trials=2)).on_validation_end(trainer, None)
-        stopped.append(trainer.should_stop)
-        return False
-
-    search.stop = validate
-    assert search.start("hparams_search.trials=4") == 0
-    assert stopped == [False, False, True, False]
 
 
 def test_the_objective_weighs_roles_alike_and_counts_shapes_without_a_surface():

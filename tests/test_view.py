@@ -14,9 +14,8 @@ from sdfhub.errors import SdfhubError
 from sdfhub.scans.scan import read_scan
 from sdfhub.space import reconstruct
 from sdfhub.tasks import view as view_task
-from sdfhub.viewer.dropped_scan import fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
-from sdfhub.viewer.page import MEAN, Viewer, told
+from sdfhub.viewer.page import MEAN, Viewer, fit_scan, paragraph
 from tests.ball_space import IDS, RADII, write_ball_run
 from tests.tiny import composed
 
@@ -136,7 +135,7 @@ def size_shown(viewer) -> float:
 
 
 def shows(viewer, name: str):
-    wait_until(lambda: told(name, "name") in viewer.name.content)
+    wait_until(lambda: paragraph(name, "name") in viewer.name.content)
 
 
 def test_the_live_mesh_is_the_spaces_mesh(space):

@@ -19,14 +19,13 @@ log = logging.getLogger(__name__)
 class WholeFileIO(TorchCheckpointIO):
     """Writes a checkpoint whole or not at all; reads none that is damaged.
 
-    Lightning's own writer goes through the temporary folder and copies across file systems: a kill at the
-    wrong moment leaves half a file where the last good one was.
+    Lightning's own writer copies across file systems: a kill leaves half a file where the last good one was.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path, storage_options: Any | None = None) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         write_checkpoint(checkpoint, Path(path))
 
-    def load_checkpoint(self, path, map_location: Any = "cpu", weights_only: bool | None = True) -> dict:
+    def load_checkpoint(self, path: Any, map_location: Any = "cpu", weights_only: Any = True) -> dict:
         return read_checkpoint(Path(path), map_location)
 
 
@@ -70,7 +69,7 @@ class StopOnSignal(L.Callback):
             return  # the gradient is still accumulated
         if not trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
             return
-        save_last(trainer, self.path)
+        self._save(trainer)
         log.warning("stopped after step %d: %s", trainer.global_step, self.path)
         number = self._signal or signal.SIGTERM  # another process of the run received it
         if number == signal.SIGUSR1:
@@ -80,20 +79,18 @@ class StopOnSignal(L.Callback):
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._stop_listening()
-        save_last(trainer, self.path)  # the last epoch need not have been one of every_n_epochs
+        self._save(trainer)  # the last epoch need not have been one of every_n_epochs
         if self._signal is not None:
             raise SystemExit(128 + self._signal)
 
     def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
         self._stop_listening()
 
+    def _save(self, trainer: Any) -> None:
+        if not trainer.fast_dev_run:
+            trainer.save_checkpoint(self.path)
+
     def _stop_listening(self) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers = {}
-
-
-def save_last(trainer: L.Trainer, path: Path) -> None:
-    """Writes the trainer's state, but in a `fast_dev_run`, which leaves no checkpoint."""
-    if not trainer.fast_dev_run:
-        trainer.save_checkpoint(path)

@@ -16,6 +16,7 @@ from PIL import Image
 
 from sdfhub.geometry.mesh_file import write_row
 from sdfhub.geometry.up_axis import UpAxis, turned_up
+from sdfhub.shapes import Mesh
 
 TENSORBOARD_VERTICES = 60_000
 """TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""
@@ -23,28 +24,14 @@ TENSORBOARD_VERTICES = 60_000
 
 @singledispatch
 def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> None:
-    """Shows a picture in a logger.
-
-    Args:
-        logger: one of the trainer's.
-        name: of the picture, the same at every step; parts are separated by "/".
-        image: [H, W, 3] uint8.
-        step: of the training.
-    """
+    """Shows a picture [H, W, 3] uint8 under a name, the same at every step, whose parts "/" separates."""
 
 
 @singledispatch
 def show_mesh(
     logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: UpAxis, step: int
 ) -> None:
-    """Shows a mesh upright in a logger.
-
-    Args:
-        logger, name, step: as for `show_picture`.
-        vertices: [V, 3], normalised frame.
-        faces: [F, 3], F > 0.
-        up: the axis of the mesh that points up.
-    """
+    """Shows a mesh upright: vertices [V, 3], normalised frame, faces [F, 3], F > 0, its upward axis."""
 
 
 @show_picture.register
@@ -58,9 +45,8 @@ def _(logger: TensorBoardLogger, name, vertices, faces, up, step):
         share = 1 - TENSORBOARD_VERTICES / len(vertices)
         vertices, faces = fast_simplification.simplify(vertices.astype(np.float32), faces, share)
     vertices, faces = np.asarray(turned_up(vertices, up, "y"), np.float32), np.asarray(faces, np.int32)
-    logger.experiment.add_mesh(
-        name, torch.from_numpy(vertices)[None], faces=torch.from_numpy(faces)[None], global_step=step
-    )
+    arrays = torch.from_numpy(vertices)[None], None, torch.from_numpy(faces)[None]
+    logger.experiment.add_mesh(name, *arrays, global_step=step)
 
 
 @show_picture.register
@@ -72,7 +58,7 @@ def _(logger: CSVLogger, name, image, step):
 
 @show_mesh.register
 def _(logger: CSVLogger, name, vertices, faces, up, step):
-    write_row([(vertices, faces)], up, Path(logger.log_dir) / name / f"{step:08d}.glb")
+    write_row([Mesh(vertices, faces)], up, Path(logger.log_dir) / name / f"{step:08d}.glb")
 
 
 @show_picture.register
@@ -85,8 +71,8 @@ def _(logger: WandbLogger, name, vertices, faces, up, step):
     import wandb  # an extra
 
     with tempfile.TemporaryDirectory() as folder:
-        write_row([(vertices, faces)], up, path := Path(folder) / "mesh.glb")
-        logger.log_metrics({name: wandb.Object3D(str(path))}, step)  # copies the file
+        write_row([Mesh(vertices, faces)], up, path := Path(folder) / "mesh.glb")
+        logger.log_metrics({name: wandb.Object3D(str(path))}, step)  # type: ignore[dict-item]  # copies the file
 
 
 @show_picture.register
@@ -97,5 +83,5 @@ def _(logger: MLFlowLogger, name, image, step):
 @show_mesh.register
 def _(logger: MLFlowLogger, name, vertices, faces, up, step):
     with tempfile.TemporaryDirectory() as folder:
-        write_row([(vertices, faces)], up, path := Path(folder) / f"{step:08d}.glb")
+        write_row([Mesh(vertices, faces)], up, path := Path(folder) / f"{step:08d}.glb")
         logger.experiment.log_artifact(logger.run_id, str(path), artifact_path=name)

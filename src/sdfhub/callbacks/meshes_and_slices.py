@@ -1,23 +1,30 @@
 """Callbacks that show the first training shapes during a training: meshes beside the truth, and slices."""
 
+from typing import Annotated, Any
+
 import lightning as L
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from sdfhub.callbacks.media import show_mesh, show_picture
 from sdfhub.callbacks.training_record import clock_stopped
 from sdfhub.data.store.store import StoredShape
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.mesher import Mesh, sdf_slice
+from sdfhub.geometry.mesher import sdf_slice
 from sdfhub.geometry.metrics import ShapeMetrics, judge
 from sdfhub.geometry.render import render, slice_image
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import distances
+from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.space import reconstruct
 
 METRICS = {"cd": 1e3, "excess": 1e3, "normal_consistency": 1.0, "f_score": 1.0}
 """What `MeshShapes` logs, and the factor of each: Chamfer distances are times 10^3, as in the tables."""
+
+Count = Annotated[int, Field(ge=1)]
+GridSize = Annotated[int, Field(ge=2)]
 
 
 class ShapesShown(L.Callback):
@@ -25,15 +32,9 @@ class ShapesShown(L.Callback):
 
     The steps depend on the training's length alone, so a continued training shows the same ones. The record
     of the training does not count the seconds spent here. Subclasses write `show`.
-
-    Args:
-        times: how often, >= 1.
-        shapes: how many, from the front of the code table, >= 1.
     """
 
-    def __init__(self, times: int = 8, shapes: int = 2):
-        if min(times, shapes) < 1:
-            raise ValueError(f"times={times}, shapes={shapes}: must be at least 1")
+    def __init__(self, times: Count = 8, shapes: Count = 2):
         self.times, self.shapes = times, shapes
         self._shown_at: int | None = None
 
@@ -41,16 +42,16 @@ class ShapesShown(L.Callback):
         """Shows the shapes of the first rows of the code table; the module is in evaluation mode."""
         raise NotImplementedError
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, *_) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: Any) -> None:
         step, steps = trainer.global_step, trainer.estimated_stepping_batches  # inf where no end is set
         if step and step * self.times // steps > (step - 1) * self.times // steps:
             self._show(trainer, module)
 
-    def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         self._show(trainer, module)
 
     @torch.inference_mode()
-    def _show(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+    def _show(self, trainer: Any, module: AutoDecoder) -> None:
         if self._shown_at == trainer.global_step or not trainer.is_global_zero:
             return
         self._shown_at, training = trainer.global_step, module.training
@@ -67,45 +68,43 @@ class MeshShapes(ShapesShown):
 
     Args:
         times, shapes: as for `ShapesShown`.
-        resolution: points along an axis of the marching-cubes grid, >= 2.
-        points: surface points a side of the Chamfer distance, >= 1.
+        resolution, points: along an axis of the marching-cubes grid; a side of the Chamfer distance.
     """
 
-    def __init__(self, times: int = 8, shapes: int = 2, resolution: int = 96, points: int = 10_000):
+    def __init__(
+        self, times: Count = 8, shapes: Count = 2, resolution: GridSize = 96, points: Count = 10_000
+    ):
         super().__init__(times, shapes)
-        if points < 1 or resolution < 2:
-            raise ValueError(f"points={points}, resolution={resolution}: must be at least 1 and 2")
         self.resolution, self.points = resolution, points
         self._truth_pictures: dict[str, np.ndarray] = {}  # of the shapes whose true mesh was shown
 
     def show(self, trainer: L.Trainer, module: AutoDecoder, shapes: list[StoredShape]) -> None:
-        rows = [row for row, shape in enumerate(shapes) if shape.mesh is not None]
-        metrics = [self._show_shape(trainer, module, row, shapes[row]) for row in rows]
-        judged = [row for row in metrics if not row.failed]
+        pairs = [(row, shape, shape.mesh) for row, shape in enumerate(shapes)]
+        metrics = [self._show_shape(trainer, module, row, shape, mesh) for row, shape, mesh in pairs if mesh]
+        judged = [scores for scores in metrics if not scores.failed]
         values = {"mesh/failed": float(len(metrics) - len(judged))} if metrics else {}
         for name, factor in METRICS.items() if judged else ():
-            values[f"mesh/{name}"] = factor * float(np.mean([getattr(row, name) for row in judged]))
+            values[f"mesh/{name}"] = factor * float(np.mean([getattr(scores, name) for scores in judged]))
         for logger in trainer.loggers:  # not self.log, which drops what lies between two log_every_n_steps
             logger.log_metrics(values, trainer.global_step)
 
-    def _show_shape(self, trainer, module: AutoDecoder, row: int, shape: StoredShape) -> ShapeMetrics:
-        mesh, truth, step = self._mesh(module, row), shape.mesh, trainer.global_step
+    def _show_shape(
+        self, trainer: L.Trainer, module: AutoDecoder, row: int, shape: StoredShape, truth: NormalizedMesh
+    ) -> ShapeMetrics:
+        try:
+            mesh = next(reconstruct(module.decoder, module.codes.table[row][None], self.resolution))
+        except SdfhubError:  # the field is not finite: the loss will say so, with a hint
+            mesh = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
         if shape.id not in self._truth_pictures:
             self._truth_pictures[shape.id] = render(truth.vertices, truth.faces, up=shape.up)
             for logger in trainer.loggers:
                 show_mesh(logger, f"{shape.id}/truth", truth.vertices, truth.faces, shape.up, 0)
         pair = np.hstack([self._truth_pictures[shape.id], render(*mesh, up=shape.up)])
         for logger in trainer.loggers:
-            if len(mesh[1]):
-                show_mesh(logger, f"{shape.id}/reconstruction", *mesh, shape.up, step)
-            show_picture(logger, f"{shape.id}/truth_and_reconstruction", pair, step)
+            if len(mesh.faces):
+                show_mesh(logger, f"{shape.id}/reconstruction", *mesh, shape.up, trainer.global_step)
+            show_picture(logger, f"{shape.id}/truth_and_reconstruction", pair, trainer.global_step)
         return judge(mesh, truth, points=self.points)
-
-    def _mesh(self, module: AutoDecoder, row: int) -> Mesh:
-        try:
-            return next(reconstruct(module.decoder, module.codes.table[row][None], self.resolution))
-        except SdfhubError:  # the field is not finite: the loss will say so, with a hint
-            return np.empty((0, 3)), np.empty((0, 3), np.int64)
 
 
 class Slices(ShapesShown):

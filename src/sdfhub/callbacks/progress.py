@@ -10,28 +10,15 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar, RichPr
 log = logging.getLogger(__name__)
 
 
-class WithoutVersion:
-    """A progress bar without Lightning's version number, which is no number here."""
-
-    def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
-        return {key: value for key, value in super().get_metrics(trainer, module).items() if key != "v_num"}
-
-
-class TqdmBar(WithoutVersion, TQDMProgressBar):
-    """Lightning's bar by tqdm."""
-
-
-class RichBar(WithoutVersion, RichProgressBar):
-    """Lightning's bar by rich."""
-
-
 class ProgressLines(ProgressBar):
     """A line with the loss at every tenth of a training: in a file a bar is ten thousand lines."""
 
     def disable(self) -> None:
         """Has no effect: lines are logged by the first process alone."""
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, outputs, *_: Any) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, *_: Any
+    ) -> None:
         step, steps = trainer.global_step, trainer.estimated_stepping_batches  # inf where no end is set
         if trainer.is_global_zero and step * 10 // steps > (step - 1) * 10 // steps:
             epoch, loss = trainer.current_epoch + 1, float(outputs["loss"])
@@ -40,21 +27,15 @@ class ProgressLines(ProgressBar):
 
 def progress(bar: Literal["tqdm", "rich"] = "tqdm") -> ProgressBar:
     """A progress bar if stdout is a terminal, else lines."""
-    if bar not in ("tqdm", "rich"):
-        raise ValueError(f"bar={bar!r}: must be tqdm or rich")
     if not sys.stdout.isatty():
         return ProgressLines()
-    return TqdmBar() if bar == "tqdm" else RichBar()
+    return RichProgressBar() if bar == "rich" else TQDMProgressBar()
 
 
 def fitting_callbacks(callbacks: list[L.Callback], loggers: bool, progress_bar: bool) -> list[L.Callback]:
     """The callbacks that a trainer takes: Lightning refuses some where it has nothing for them to do.
 
-    Args:
-        callbacks: all that are configured.
-        loggers: whether the trainer has any; a `LearningRateMonitor` needs one.
-        progress_bar: the trainer's `enable_progress_bar`.
+    A `LearningRateMonitor` needs a logger, a bar the trainer's `enable_progress_bar`.
     """
-    dropped = () if loggers else (LearningRateMonitor,)
-    dropped += () if progress_bar else (ProgressBar,)
+    dropped = (*([] if loggers else [LearningRateMonitor]), *([] if progress_bar else [ProgressBar]))
     return [callback for callback in callbacks if not isinstance(callback, dropped)]

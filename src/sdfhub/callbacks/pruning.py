@@ -1,6 +1,5 @@
 """Trainings of an Optuna search that are not promising end early."""
 
-import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,23 +9,18 @@ from sdfhub.errors import SdfhubError
 
 if TYPE_CHECKING:
     from optuna.pruners import BasePruner
-    from optuna.trial import Trial
-
-log = logging.getLogger(__name__)
 
 
 class OptunaPruning(L.Callback):
     """Reports a metric to a search's study at each validation; stops the training if the pruner says so.
 
     What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's
-    sweeper does not tell a training its trial: it is the newest running one with the training's parameters.
+    sweeper hands no trial on: it is the newest running one with the training's parameters.
 
     Args:
-        storage: URL of the study's database.
-        study: its name there.
+        storage, study: URL of the study's database, and its name there.
         overrides: of this training, `key=value`.
-        pruner: decides; a study does not keep one.
-        monitor: name of the metric, which is minimised.
+        pruner, monitor: what decides, and the name of the metric, which is minimised.
     """
 
     def __init__(
@@ -39,35 +33,22 @@ class OptunaPruning(L.Callback):
     ):
         self.storage, self.study, self.overrides = storage, study, set(overrides)
         self.pruner, self.monitor = pruner, monitor
-        self.trial: Trial | None = None
 
-    def on_fit_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.sanity_checking:
+            return
         import optuna  # an extra, and slow to import
 
-        sampler = optuna.samplers.RandomSampler()  # draws nothing: the sweeper has drawn
+        if self.monitor not in trainer.callback_metrics:
+            raise SdfhubError(f"callbacks.pruning.monitor={self.monitor}: no validation logs it")
         try:
-            study = optuna.load_study(self.study, self.storage, sampler, self.pruner)
+            study = optuna.load_study(study_name=self.study, storage=self.storage, pruner=self.pruner)
         except KeyError as error:
-            raise SdfhubError(
-                f"callbacks.pruning: there is no study {self.study!r} in {self.storage}"
-            ) from error
-        running = study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.RUNNING])
-        ours = [
-            trial
-            for trial in running
-            if {f"{name}={value}" for name, value in trial.params.items()} <= self.overrides
-        ]
+            raise SdfhubError(f"callbacks.pruning: no study {self.study!r} in {self.storage}") from error
+        running = study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,))
+        ours = [t for t in running if {f"{k}={v}" for k, v in t.params.items()} <= self.overrides]
         if not ours:
-            raise SdfhubError(
-                "callbacks.pruning: no running trial has this training's settings; use -m search="
-            )
-        self.trial = optuna.trial.Trial(study, ours[-1]._trial_id)
-
-    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        value = trainer.callback_metrics.get(self.monitor)
-        if trainer.sanity_checking or self.trial is None or value is None:
-            return
-        self.trial.report(float(value), trainer.global_step)
-        if self.trial.should_prune():
-            log.info("pruned after step %d: %s %.4g", trainer.global_step, self.monitor, float(value))
-            trainer.should_stop = True
+            raise SdfhubError("callbacks.pruning: no running trial has this training's settings")
+        trial = optuna.trial.Trial(study, ours[-1]._trial_id)
+        trial.report(float(trainer.callback_metrics[self.monitor]), trainer.global_step)
+        trainer.should_stop = trainer.should_stop or trial.should_prune()

@@ -1,9 +1,10 @@
-"""Seconds, steps and losses of a training, for `metrics.json`."""
+"""Seconds, steps and last losses of a training, for `metrics.json`."""
 
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -11,37 +12,27 @@ from torch import Tensor
 
 from sdfhub.model.autodecoder import AutoDecoder
 
+LAST = 20  # steps whose losses are averaged
+
 
 class TrainingRecord(L.Callback):
-    """Seconds, steps and the loss at both ends of a training.
+    """Seconds, steps and the last losses of a training.
 
     The clock starts after the first step of a process, in which loops are compiled. It stands still during
     validation and in `clock_stopped`. What an interrupted training had gathered by its last checkpoint counts
     when the training is continued.
     """
 
-    ENDS = 20
-    """Steps averaged at either end."""
-
-    def __init__(self):
-        self._first: list[float | Tensor] = []  # tensors until a number is needed: a GPU would be waited for
-        self._last: deque[float | Tensor] = deque(maxlen=self.ENDS)
+    def __init__(self) -> None:
+        self._losses: deque[float | Tensor] = deque(maxlen=LAST)  # tensors: a GPU would be waited for
         self._seconds = 0.0  # up to the last start of the clock, in all processes
         self._started: float | None = None
-        self._validating = False  # and the clock ran before
         self.stepped = False  # by this process
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: AutoDecoder, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, outputs: Any, *_: Any) -> None:
         if not self.stepped:
-            self.stepped = True
-            self.start_clock()
-        self._last.append(outputs["loss"])
-        if len(self._first) < self.ENDS:
-            self._first.append(outputs["loss"])
-
-    def start_clock(self) -> None:
-        """Counts seconds from now on."""
-        self._started = time.perf_counter()
+            self.stepped, self._started = True, time.perf_counter()
+        self._losses.append(outputs["loss"])
 
     def stop_clock(self) -> bool:
         """Counts no seconds from now on; returns whether it did before."""
@@ -49,46 +40,41 @@ class TrainingRecord(L.Callback):
         self._seconds, self._started = self._so_far(), None
         return was_running
 
-    def on_validation_start(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        self._validating = self.stop_clock()
+    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
+        self.stop_clock()
 
-    def on_validation_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
-        if self._validating:
-            self.start_clock()
+    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
+        self._started = time.perf_counter() if self.stepped else None
 
-    def on_train_end(self, trainer: L.Trainer, module: AutoDecoder) -> None:
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         self.stop_clock()
 
     def _so_far(self) -> float:
         return self._seconds + (time.perf_counter() - self._started if self._started else 0.0)
 
-    def state_dict(self) -> dict:
-        ends = {"first": self._first, "last": self._last}
-        return {"seconds": self._so_far()} | {end: [float(loss) for loss in ends[end]] for end in ends}
+    def state_dict(self) -> dict[str, Any]:
+        return {"seconds": self._so_far(), "last": [float(loss) for loss in self._losses]}
 
-    def load_state_dict(self, state: dict) -> None:
-        self._seconds, self._first = float(state["seconds"]), [float(loss) for loss in state["first"]]
-        self._last.extend(float(loss) for loss in state["last"])
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._seconds = state["seconds"]
+        self._losses.extend(state["last"])
 
-    def summary(self, model: AutoDecoder) -> dict:
-        """Plain numbers: seconds and steps of the whole training, parameters, loss at both ends."""
-        state = self.state_dict()
-        mean = {"start": np.mean(state["first"]), "end": np.mean(state["last"])} if self._last else {}
+    def summary(self, model: AutoDecoder) -> dict[str, Any]:
+        """Plain numbers: seconds and steps of the whole training, parameters, loss at its end."""
         return {
-            "seconds": state["seconds"],
+            "seconds": self._so_far(),
             "steps": model.global_step,
             "parameters": sum(parameter.numel() for parameter in model.decoder.parameters()),
-            "loss": {key: float(value) for key, value in mean.items()},
+            "loss": {"end": float(np.mean([float(loss) for loss in self._losses]))} if self._losses else {},
         }
 
 
 @contextmanager
 def clock_stopped(trainer: L.Trainer) -> Iterator[None]:
     """The trainer's `TrainingRecord`, if it has one, counts no seconds within; for callbacks that draw."""
-    records = [callback for callback in trainer.callbacks if isinstance(callback, TrainingRecord)]
+    callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    records = [callback for callback in callbacks if isinstance(callback, TrainingRecord)]
     was_running = [record for record in records if record.stop_clock()]
-    try:
-        yield
-    finally:
-        for record in was_running:
-            record.start_clock()
+    yield
+    for record in was_running:
+        record._started = time.perf_counter()

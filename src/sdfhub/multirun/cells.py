@@ -35,11 +35,6 @@ def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, A
 
     A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher.
 
-    Args:
-        train: the training.
-        config: composed, without Hydra's own part.
-        hydra: Hydra's own part.
-
     Returns:
         What `metrics.json` holds; empty for a cell that failed or that another process trains.
     """
@@ -87,14 +82,14 @@ def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
     """A composed cell as `sweep.json` keeps it; a ValueError for a seed that is no whole number."""
     choices = choices_of(config, hydra)
-    words = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} stays as written
-    pairs = (word.lstrip("+~").partition("=") for word in words)
-    settings = {key: value for key, _, value in pairs if key not in choices or key in UNNAMED_GROUPS}
+    words: Any = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} as written
+    pairs = [word.lstrip("+~").partition("=") for word in words]
+    named = {group for group in choices if group not in UNNAMED_GROUPS}
     return PlannedCell(
         folder=folder,
         choices={group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS},
         settings={
-            key: value for key, value in settings.items() if not key.startswith(("seed", *WHERE_NOT_WHAT))
+            k: v for k, _, v in pairs if k not in named and not k.startswith(("seed", *WHERE_NOT_WHAT))
         },
         seed=config.seed,
     )

@@ -4,6 +4,7 @@ import os
 import re
 import uuid
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -16,9 +17,8 @@ NAMED_GROUPS = ("data", "category", "experiment", "activation", "encoding", "nor
 
 def register_resolvers() -> None:
     """Makes the functions that conf/ calls known to OmegaConf, here or in a launcher's worker."""
-    for resolver in (run_name, run_stamp, sweep_name, cell_name, trials_done, trials_left):
+    for resolver in (run_name, run_stamp, sweep_name, cell_name, trials_done, trials_left, eighth):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-    OmegaConf.register_new_resolver("eighth", eighth, replace=True)
     # Hydra hands cached values on from a multirun to its cells: `once` gives them all one folder
     OmegaConf.register_new_resolver("once", lambda value: value, use_cache=True, replace=True)
     # two runs that start in one second must not share a folder
@@ -61,7 +61,7 @@ def choices_of(config: DictConfig, hydra: DictConfig) -> dict[str, str]:
     """The choice of each group; shapes of a source without categories are called by its folder."""
     choices = hydra.runtime.choices.items()
     choices = {group: str(choice) for group, choice in choices if choice and "/" not in group}
-    source = OmegaConf.select(config, "data.source") or {}
+    source: Any = OmegaConf.select(config, "data.source") or {}
     if source.get("root") and not source.get("categories"):
         choices["category"] = Path(source.root).resolve().name
     return choices
@@ -69,15 +69,13 @@ def choices_of(config: DictConfig, hydra: DictConfig) -> dict[str, str]:
 
 def _joined(root: DictConfig, groups: tuple[str, ...]) -> str:
     choices = choices_of(root, root.hydra)
-    words = [
-        ("normals-" if group == "normals" else "") + choices[group] for group in groups if group in choices
-    ]
+    words = [("normals-" if g == "normals" else "") + choices[g] for g in groups if g in choices]
     return "_".join(re.sub(r"[^\w.-]+", "-", word) for word in words)
 
 
 def _digest(root: DictConfig) -> str:
     """The digest of a composed config; `${hydra:...}`, which only a started job knows, counts as written."""
-    written = OmegaConf.to_container(root, resolve=False)
+    written: Any = OmegaConf.to_container(root, resolve=False)
     del written["hydra"]
     settings = deciding(written)
     for key, text in settings.items():

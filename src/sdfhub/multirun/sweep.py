@@ -65,15 +65,11 @@ class SweepRecord(Callback):
 
 
 def planned_cells(config: DictConfig) -> list[PlannedCell]:
-    """The cells that Hydra's own sweeper will train; [] under a sweeper that decides as it goes.
-
-    Args:
-        config: of the multirun, Hydra's own part included.
-    """
+    """The cells that Hydra's own sweeper will train; [] under a sweeper that decides as it goes."""
     if not str(config.hydra.sweeper._target_).endswith(".BasicSweeper"):
         return []
     loader = GlobalHydra.instance().config_loader()
-    params = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
+    params: Any = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
     words = [f"{key}={value}" for key, value in params.items()] + _words(config)
     overrides = OverridesParser.create(config_loader=loader).parse_overrides(words)
     (jobs,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
@@ -83,7 +79,7 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
 
 def _words(config: DictConfig, part: str = "task") -> list[str]:
     """The overrides of the command line as they were typed."""
-    return OmegaConf.to_container(config.hydra.overrides[part], resolve=False)
+    return list(map(str, OmegaConf.to_container(config.hydra.overrides[part], resolve=False) or ()))
 
 
 def _refuse(message: str) -> None:

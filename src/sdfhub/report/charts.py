@@ -3,19 +3,35 @@
 import base64
 import io
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sdfhub.report.rows import Group, Row
+from sdfhub.report.results import ROLES
+from sdfhub.report.rows import Group
+from sdfhub.report.tables import TITLES
 
-STYLE = {"svg.fonttype": "none", "svg.hashsalt": "sdfhub", "font.family": "sans-serif", "font.size": 9}
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sdfhub",
+    "font.family": "sans-serif",
+    "font.size": 9,
+}
 STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, "axes.spines.right": False}
 
 KEEP = {"scalars": 0, "images": 1, "audio": 1, "histograms": 1, "tensors": 1}
 """Of each tag in an event file; 0 keeps all."""
+
+
+def charts(group: Group) -> list[tuple[str, str]]:
+    """Caption and SVG, as a data URI, of each chart that there is something to draw in."""
+    pictures = {"Loss of signed distances while training, a line a seed": loss_chart(group)}
+    for role in ROLES:
+        pictures[f"{TITLES[role]}: CD of each, all seeds; the bar is the median"] = shape_chart(group, role)
+    return [(caption, chart) for caption, chart in pictures.items() if chart]
 
 
 @matplotlib.rc_context(STYLE)
@@ -23,10 +39,12 @@ def loss_chart(group: Group) -> str | None:
     """Loss of signed distances by step, a line a seed, as a data URI; None where no run has kept it."""
     figure = Figure((7.6, 4.2), layout="constrained")
     axes = figure.subplots()
-    for row in group.rows:
-        for number, curve in enumerate(filter(None, (loss_curve(cell.folder) for cell in row.done))):
-            label = _text(row.label) if number == 0 else None
-            axes.plot(*zip(*curve, strict=True), **_style(group, row), lw=1.3, label=label)
+    for index, row in enumerate(group.rows):
+        curves = filter(None, (loss_curve(cell.folder) for cell in row.done))
+        for number, curve in enumerate(curves):
+            label = None if number else _text(row.label)
+            line = "-" if row.normals == "on" else "--"
+            axes.plot(*zip(*curve, strict=True), color=f"C{index % 10}", ls=line, lw=1.3, label=label)
     if not axes.lines:
         return None
     axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
@@ -41,23 +59,20 @@ def shape_chart(group: Group, role: str) -> str | None:
     A bar stands at each row's median, a dotted line at the noise floor; the worst shape is named.
     """
     shapes = group.shapes[(group.shapes["role"] == role) & (group.shapes["cd"] > 0)]
-    rows = [row for row in group.rows if (shapes["label"] == row.label).any()]
-    if not rows:
+    labels = list(dict.fromkeys(shapes["label"]))
+    if not labels:
         return None
-    figure = Figure((7.6, 0.8 + 0.3 * len(rows)), layout="constrained")
+    figure = Figure((7.6, 0.8 + 0.3 * len(labels)), layout="constrained")
     axes = figure.subplots()
-    for height, row in enumerate(rows):
-        line = shapes[shapes["label"] == row.label]
-        style, cds = _style(group, row), line["cd"].to_numpy()
-        spread = height + 0.035 * (np.arange(len(cds)) * 5 % 9 - 4)  # the same at every drawing
-        face = style["color"] if row.normals == "on" else "none"
-        axes.scatter(cds, spread, s=14, color=face, edgecolors=style["color"], alpha=0.7)
-        axes.vlines(np.median(cds), height - 0.35, height + 0.35, color=style["color"], lw=2.5)
-        place = {"xytext": (5, 0), "textcoords": "offset points", "fontsize": 7, "va": "center"}
-        axes.annotate(_text(line["shape"].iloc[cds.argmax()]), (cds.max(), spread[cds.argmax()]), **place)
+    for height, label in enumerate(labels):
+        line, colour = shapes[shapes["label"] == label], f"C{height % 10}"
+        worst = line.loc[line["cd"].idxmax()]
+        axes.scatter(line["cd"], np.full(len(line), height), s=14, color=colour, alpha=0.5)
+        axes.vlines(line["cd"].median(), height - 0.35, height + 0.35, color=colour, lw=2.5)
+        axes.annotate(_text(worst["shape"]), (worst["cd"], height - 0.15), fontsize=7)
     axes.axvline(shapes["floor"].mean(), color="#5d6672", ls=":", lw=1)
-    axes.set(xscale="log", xlabel="CD times 10³ (dotted: noise floor)", ylim=(len(rows) - 0.5, -0.5))
-    axes.set_yticks(range(len(rows)), [_text(row.label) for row in rows])
+    axes.set(xscale="log", xlabel="CD times 10³ (dotted: noise floor)", ylim=(len(labels) - 0.5, -0.5))
+    axes.set_yticks(range(len(labels)), list(map(_text, labels)))
     return _data_uri(figure)
 
 
@@ -70,14 +85,8 @@ def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tupl
         scalars = EventAccumulator(str(folder), size_guidance=KEEP).Reload().Scalars(tag)
     except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
         return []
-    found = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
-    return found[::-1][:: max(1, -(-len(found) // points))][::-1]
-
-
-def _style(group: Group, row: Row) -> dict[str, str]:
-    """A colour for each method; dashed without normals."""
-    methods = list(dict.fromkeys(other.method for other in group.rows))
-    return {"color": f"C{methods.index(row.method) % 10}", "ls": "-" if row.normals == "on" else "--"}
+    curve = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
+    return curve[::-1][:: max(1, -(-len(curve) // points))][::-1]
 
 
 def _text(text: str) -> str:

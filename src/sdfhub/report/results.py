@@ -13,17 +13,12 @@ from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, Validatio
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked
-from sdfhub.report.plan import FAILURE, PlannedCell, read_plan
+from sdfhub.report.plan import FAILURE, PlannedCell, first_fault, read_plan
 from sdfhub.settings import flat
-
-NOISE = 1e-6
-"""Excess that 30,000 points a side cannot tell from none, normalised units squared."""
 
 ROLES = ("train", "held_out")
 
-TABLE_UNIT = 1e3
-"""Chamfer distances and errors of distances are shown times 10^3."""
-
+TABLE_UNIT = 1e3  # Chamfer distances and errors of distances are shown times 10^3
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Name = Annotated[str, StringConstraints(max_length=300)]
@@ -49,12 +44,6 @@ class ShapeScore(BaseModel, frozen=True):
         """What the Chamfer distance has above its noise floor."""
         return self.counted_cd - self.floor
 
-    def measures(self) -> dict[str, float | None]:
-        """What tables say of the shape, by name; distances times 10^3."""
-        distances = {"cd": self.counted_cd, "floor": self.floor, "excess": self.excess}
-        counts = {"normal_consistency": self.normal_consistency, "no_surface": float(self.failed)}
-        return {name: value * TABLE_UNIT for name, value in distances.items()} | counts
-
 
 class DistanceScore(BaseModel, frozen=True):
     """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
@@ -63,9 +52,8 @@ class DistanceScore(BaseModel, frozen=True):
     sdf_error: Number
     sign_accuracy: Number
 
-    def measures(self) -> dict[str, float | None]:
-        """What tables say of the shape, by name; distances times 10^3."""
-        return {"sdf_error": self.sdf_error * TABLE_UNIT, "sign_accuracy": self.sign_accuracy}
+
+RoleScores = list[ShapeScore] | list[DistanceScore]
 
 
 class Training(BaseModel, frozen=True):
@@ -79,53 +67,44 @@ class Training(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a finished cell.
+    """The scores of a finished cell."""
 
-    Args:
-        shapes: judged shapes by role.
-        training: its cost.
-        trained_on: training shapes, without augmented copies.
-        config: the content of `config.yaml`.
-    """
-
-    shapes: dict[str, list[ShapeScore] | list[DistanceScore]]
+    shapes: dict[str, RoleScores]  # by role
     training: Training
-    trained_on: int
-    config: dict[str, Any]
+    trained_on: int  # shapes, without augmented copies
+    config: dict[str, Any]  # of config.yaml
 
-    def costs(self) -> dict[str, float | None]:
+    def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
-        costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
-        get = flat(self.config).get
+        costs: dict[str, float] = self.training.model_dump(exclude={"made_with"})
+        costs["trained_on"] = self.trained_on
+        settings = flat(self.config)
         try:
-            costs["epochs"] = min(int(get("trainer.max_epochs")), 10**12)
-            rows = self.trained_on * (1 + int(get("data.loader.augmentation.copies") or 0))
-            shapes = min(rows, int(get("data.loader.shapes_per_step")))
-            costs["samples"] = (
-                shapes * min(int(get("data.loader.samples_per_shape")), 10**12) * costs["steps"]
-            )
-        except (TypeError, ValueError, OverflowError):
+            costs["epochs"] = float(int(settings["trainer.max_epochs"]))
+            rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
+            shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
+            samples = shapes * int(settings["data.loader.samples_per_shape"])
+            costs["samples"] = float(samples * self.training.steps)
+        except (KeyError, TypeError, ValueError, OverflowError):
             pass  # a loader of the user's own
         return costs
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a sweep as it stands.
-
-    Args:
-        plan: what it is.
-        folder: where it lies.
-        state: `failed` also where its files are broken.
-        reason: why there are no scores; empty where there are.
-        scores: None unless `state` is done.
-    """
+    """A cell of a sweep as it stands; `failed` also where its files are broken."""
 
     plan: PlannedCell
     folder: Path
     state: Literal["done", "failed", "missing"]
-    reason: str = ""
-    scores: Scores | None = None
+    reason: str = ""  # why there are no scores
+    scores: Scores | None = None  # of a cell that is done
+
+    @property
+    def result(self) -> Scores:
+        """The scores of a cell that is done."""
+        assert self.scores is not None
+        return self.scores
 
 
 def read_sweep(sweep: Path) -> list[Cell]:
@@ -144,12 +123,11 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
         if is_locked(folder / ".lock"):
             return Cell(plan, folder, "missing", "is being trained")
         if (folder / FAILURE).exists():
-            reason = _loaded(folder, FAILURE).get("reason", "for a reason that was not written down")
-            return Cell(plan, folder, "failed", str(reason)[:500])
+            return Cell(plan, folder, "failed", str(_loaded(folder, FAILURE).get("reason"))[:500])
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
             return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
-        return Cell(plan, folder, "done", "", read_scores(folder))
+        return Cell(plan, folder, "done", scores=read_scores(folder))
     except (SdfhubError, OSError) as error:
         return Cell(plan, folder, "failed", str(error))
 
@@ -160,14 +138,10 @@ def read_scores(folder: Path) -> Scores:
     Raises:
         SdfhubError: a file is missing, broken or not what training writes.
     """
-    metrics = _loaded(folder, "metrics.json")
-    if "known" in metrics:  # the name of the role before it was `train`
-        metrics["train"] = metrics.pop("known")
-    shapes = {}
+    metrics, shapes = _loaded(folder, "metrics.json"), {}
     for role in filter(metrics.get, ROLES):
-        content = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}")
-        rows = _checked(list[dict], content.get("shapes"), f"metrics.json: {role}.shapes")
-        kind = DistanceScore if rows and "sdf_error" in rows[0] else ShapeScore
+        rows = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}").get("shapes")
+        kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
         shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
     training = _checked(Training, metrics.get("training"), "metrics.json: training")
     trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
@@ -176,9 +150,9 @@ def read_scores(folder: Path) -> Scores:
 
 def _loaded(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise SdfhubError(f"{name}: is a link out of its folder")
     try:
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise SdfhubError(f"{name}: is a link out of its folder")
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
@@ -192,5 +166,4 @@ def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise SdfhubError(f"{'.'.join([name, *map(str, first['loc'])])}: {first['msg'].lower()}") from error
+        raise SdfhubError(f"{name}.{first_fault(error)}") from error

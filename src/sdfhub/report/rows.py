@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from scipy import stats
 
-from sdfhub.report.results import ROLES, Cell
+from sdfhub.report.results import ROLES, TABLE_UNIT, Cell
 from sdfhub.settings import OF_THE_SEED, deciding
 
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
@@ -20,27 +19,21 @@ JUDGING_GROUPS = ("sweeps", "data", "category", "scale", "fit", "evaluate")
 JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
 """Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
 
-MEASURES = ("cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy")
-COSTS = ("trained_on", "parameters", "epochs", "steps", "samples", "seconds")
+MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
+PLACES = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
+SCORED = ["cd", "floor", "cd_penalty", "failed", "normal_consistency", "sdf_error", "sign_accuracy"]
+COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 
-NONE = "–"
-"""What tables show where there is nothing."""
+NONE = "–"  # what tables show where there is nothing
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method in a group of comparable cells.
+    """A method in a group of comparable cells, one a seed."""
 
-    Args:
-        method: as the paper writes it: `FFT/SIREN`.
-        normals: `on` or `off`.
-        detail: what else tells the row from others of its method; mostly empty.
-        cells: one a seed.
-    """
-
-    method: str
-    normals: str
-    detail: str
+    method: str  # as the paper writes it: `FFT/SIREN`
+    normals: str  # `on` or `off`
+    detail: str  # what else tells the row from others of its method; mostly empty
     cells: list[Cell]
 
     @property
@@ -61,21 +54,21 @@ class Row:
 
     @property
     def searched(self) -> str:
-        """What search the settings come from, as the experiment's config says: `no` where it says nothing."""
-        return str(self.first.scores.config.get("searched") or "no")[:200] if self.first else NONE
+        """What search the settings come from, as the experiment's config says."""
+        return str(self.first.result.config.get("searched") or "no")[:200] if self.first else NONE
 
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that may be compared: the same sweep, shapes, scale and way of judging.
+    """Rows that may be compared: the same sweep, shapes, scale and way of judging."""
 
-    Args:
-        judging: options of JUDGING_GROUPS, and values of JUDGING_SETTINGS on the command line.
-        rows: methods in the order of the commands, each with normals first.
-    """
+    judging: dict[str, str]  # options of JUDGING_GROUPS, values of JUDGING_SETTINGS on the command line
+    rows: list[Row]  # in the order of the commands, each with normals first
 
-    judging: dict[str, str]
-    rows: list[Row]
+    @property
+    def first(self) -> Cell | None:
+        """The first finished cell."""
+        return next((row.first for row in self.rows if row.first), None)
 
     @property
     def title(self) -> str:
@@ -84,55 +77,49 @@ class Group:
 
     @property
     def title_parts(self) -> list[str]:
-        """The words of the title: the category, or the name of the user's folder, first."""
-        subject = self.judging.get("category", "all")
-        if self.judging.get("data") == "folder" and "data.source.root" in self.judging:
-            subject = Path(self.judging["data.source.root"]).name
+        """The words of the title, the category first."""
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
-        counts = {cell.scores.trained_on for row in self.rows for cell in row.done}
+        counts = {cell.result.trained_on for row in self.rows for cell in row.done}
         ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
-        return [subject, *parts, f"trained on {ends}"]
+        return [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
-        """A line for each judged shape of each finished cell: MEASURES, distances times 10^3.
-
-        The `cd` of a shape without a surface is that of a single point.
-        """
+        """MEASURES of each judged shape, distances times 10^3; `cd` is that of a point where nothing is."""
         records = [
             vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
-            | {"role": role, "shape": shape.id} | shape.measures()
+            | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
-            for role, shapes in cell.scores.shapes.items()
+            for role, shapes in cell.result.shapes.items()
             for shape in shapes
         ]  # fmt: skip
-        places = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
-        return pd.DataFrame(records, columns=[*places, *MEASURES]).astype(dict.fromkeys(MEASURES, float))
+        frame = pd.DataFrame(records, columns=[*PLACES, *SCORED]).astype(dict.fromkeys(SCORED, float))
+        has_surface = (frame["failed"] == 0) & frame["cd"].notna()
+        frame["cd"] = frame["cd"].where(has_surface, frame["cd_penalty"])
+        frame["excess"] = frame["cd"] - frame["floor"]
+        frame[["cd", "floor", "excess", "sdf_error"]] *= TABLE_UNIT
+        return frame.rename(columns={"failed": "no_surface"})[[*PLACES, *MEASURES]]
 
     @cached_property
     def statistics(self) -> pd.DataFrame:
-        """Means over seeds, by label and role: `cd_mean`, `excess_median`, ..., `no_surface`, `shapes`.
-
-        Beside each column `_ci95`, the half width of its 95% interval (Student's t; none for one seed), and
-        `_seeds`, how many seeds it is the mean of.
-        """
+        """Means over seeds, by label and role: `cd_mean`, `excess_median`, ..., `no_surface`, `shapes`."""
         cells = self.shapes.groupby(["label", "role", "cell"], sort=False)
         frame = cells[[name for name in MEASURES if name != "no_surface"]].agg(["mean", "median"])
-        frame.columns = ["_".join(names) for names in frame.columns]
+        frame.columns = pd.Index(["_".join(names) for names in frame.columns])
         frame["no_surface"], frame["shapes"] = cells["no_surface"].sum(), cells.size()
         return over_seeds(frame, ["label", "role"])
 
     @cached_property
     def costs(self) -> pd.DataFrame:
         """COSTS by label, over seeds as in `statistics`."""
-        records = [{"label": row.label} | cell.scores.costs() for row in self.rows for cell in row.done]
+        records = [{"label": row.label} | cell.result.costs() for row in self.rows for cell in row.done]
         frame = pd.DataFrame(records, columns=["label", *COSTS]).astype(dict.fromkeys(COSTS, float))
         return over_seeds(frame, ["label"])
 
 
 def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """The mean of each column over the lines of equal `by`, the half width of its 95% interval, its count."""
+    """Each column's mean over lines of equal `by`; `_ci95`: half the 95% interval; `_seeds`: count."""
     seeds = cells.groupby(by, sort=False)
     count = seeds.count()
     half_width = seeds.sem() * stats.t.ppf(0.975, count - 1)  # not a number for one seed
@@ -141,18 +128,15 @@ def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 def settings_of(cell: Cell) -> dict[str, str]:
     """Settings of a finished cell by dotted key that can change its result, but for the seed's."""
-    settings = deciding(cell.scores.config).items()
+    settings = deciding(cell.result.config).items()
     return {str(k): str(v)[:200] for k, v in settings if k not in (*OF_THE_SEED, "searched")}
 
 
 def differing(settings: list[dict[str, Any]]) -> dict[str, tuple[str, ...]]:
-    """The keys in which dicts differ, and their values in each.
-
-    Keys of one last name and equal values, such as interpolated ones, are joined by a comma.
-    """
+    """The keys in which dicts differ, and their values; keys of one last name and equal values are joined."""
     joined: dict[tuple, list[str]] = {}
-    for key in dict.fromkeys(key for one in settings for key in one):
-        values = tuple(str(one.get(key, NONE)) for one in settings)
+    for key in dict.fromkeys(key for row in settings for key in row):
+        values = tuple(str(row.get(key, NONE)) for row in settings)
         if len(set(values)) > 1:
             joined.setdefault((key.rpartition(".")[2], values), []).append(key)
     return {", ".join(keys): values for (_, values), keys in joined.items()}
@@ -189,7 +173,7 @@ def _rows(cells: list[Cell]) -> list[Row]:
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
             detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
             row = Row(*_name(plan.choices), detail, part)
-            twins = sum(row.label == other.label for other in rows)  # labels name rows: no two are equal
+            twins = sum(row.label == rival.label for rival in rows)  # labels name rows: no two are equal
             rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
     methods = list(dict.fromkeys(row.method for row in rows))
     return sorted(rows, key=lambda row: (methods.index(row.method), row.normals != "on"))
@@ -201,19 +185,17 @@ def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
     for cell in cells:
         if cell.scores:
             parts.setdefault(tuple(settings_of(cell).items()), []).append(cell)
-    found = list(parts.values()) or [[]]
-    found[-1].extend(cell for cell in cells if not cell.scores)
-    return found
+    lists = list(parts.values()) or [[]]
+    lists[-1].extend(cell for cell in cells if not cell.scores)
+    return lists
 
 
 def _name(choices: dict[str, str]) -> tuple[str, str]:
     """Method and normals."""
     encoding, activation = choices.get("encoding", "none"), choices.get("activation", "?")
     is_deepsdf = choices.get("decoder") == "deepsdf" and activation == "relu"
-    method = PREFIXES.get(encoding, f"{encoding.upper()}/") + (
-        "DeepSDF" if is_deepsdf else activation.upper()
-    )
-    return method, choices.get("normals", "?")
+    method = "DeepSDF" if is_deepsdf else activation.upper()
+    return PREFIXES.get(encoding, f"{encoding.upper()}/") + method, choices.get("normals", "?")
 
 
 def _short(value: str) -> str:
@@ -229,26 +211,22 @@ def table_csv(groups: list[Group]) -> str:
     frames = [pd.DataFrame({"label": []})]
     for group in groups:
         rows = [
-            _place(group) | vars(row) | {"label": row.label, "searched": row.searched} for row in group.rows
-        ]
-        rows = [row | {"cells": len(row["cells"]), "role": role} for row in rows for role in ROLES]
-        numbers = (
-            pd.DataFrame(rows).join(group.statistics, on=["label", "role"]).join(group.costs, on="label")
-        )
-        frames.append(numbers)
+            _place(group) | vars(row) | {"label": row.label, "searched": row.searched}
+            | {"cells": len(row.cells), "role": role}
+            for row in group.rows
+            for role in ROLES
+        ]  # fmt: skip
+        numbers = pd.DataFrame(rows).join(group.statistics, on=["label", "role"])
+        frames.append(numbers.join(group.costs, on="label"))
     return pd.concat(frames[1:] or frames).to_csv(index=False, float_format="%.9g")
 
 
 def shapes_csv(groups: list[Group]) -> str:
-    """Every judged shape of every cell as numbers: a line a seed, role and shape; distances times 10^3.
-
-    No `cd` where there is no surface, whose excess counts the CD of a single point.
-    """
+    """Every judged shape of every cell as numbers, distances times 10^3; no `cd` without a surface."""
     frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
     frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
-    return frame.assign(cd=frame["cd"].where(frame["no_surface"] != 1)).to_csv(
-        index=False, float_format="%.9g"
-    )
+    frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)
+    return frame.to_csv(index=False, float_format="%.9g")
 
 
 def _place(group: Group) -> dict[str, str]:

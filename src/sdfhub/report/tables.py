@@ -3,6 +3,7 @@
 import html
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -41,28 +42,20 @@ ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the s
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text.
-
-    Args:
-        title: what it shows.
-        frame: of strings; the first column names the row.
-        note: below it.
-        best: row and column of the cells that are the best of their column.
-        prose: whether its cells are words, to be set flush left.
-    """
+    """A table of text."""
 
     title: str
-    frame: pd.DataFrame
+    frame: pd.DataFrame  # of strings; the first column names the row
     note: str = ""
-    best: set[tuple[int, int]] = field(default_factory=set)
-    prose: bool = False
+    best: set[tuple[int, int]] = field(default_factory=set)  # row and column of the best of a column
+    prose: bool = False  # whether cells are words, to be set flush left
 
 
 def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
     kinds = [("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES)]
-    found = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
-    return [table for table in (*found, _settings(group), _costs(group), _absent(group)) if table]
+    scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
+    return [table for table in (*scores, _settings(group), _costs(group), _absent(group)) if table]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -70,29 +63,29 @@ def overview(groups: list[Group]) -> list[Table]:
     if len(groups) < 2:
         return []
     common = set.intersection(*(set(group.title_parts) for group in groups))
-    labels = dict.fromkeys(row.label for group in groups for row in group.rows)
-    found = []
+    labels = list(dict.fromkeys(row.label for group in groups for row in group.rows))
+    overviews = []
     for role in ROLES:
-        columns = [pd.Series(list(labels), name="method")]
+        columns = [pd.Series(labels, name="method")]
         for group in groups:
             parts = [part for k, part in enumerate(group.title_parts) if k == 0 or part not in common]
             lines = _lines(group, role).reindex(labels)
+            statistics = ("excess_mean", "excess_median")
+            pairs = zip(*(_texts(lines, name, interval=False) for name in statistics), strict=True)
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = zip(
-                _texts(lines, "excess_mean", False), _texts(lines, "excess_median", False), seeds, strict=True
-            )
-            texts = [NONE if mean == NONE else f"{mean}, {median}{n}" for mean, median, n in texts]
-            columns.append(pd.Series(texts, name=", ".join(parts)))
+            texts = [f"{mean}, {median}{n}" for (mean, median), n in zip(pairs, seeds, strict=True)]
+            column = pd.Series(texts, name=", ".join(parts))
+            columns.append(column.mask(lines["excess_mean"].isna().to_numpy(), NONE))
         table = Table(f"{TITLES[role]}, excess", pd.concat(columns, axis=1), ABOUT_OVERVIEW)
-        found += [table] if (table.frame.iloc[:, 1:] != NONE).any(axis=None) else []
-    return found
+        overviews += [table] if (table.frame.iloc[:, 1:] != NONE).any(axis=None) else []
+    return overviews
 
 
 def origin(commands: list[str], cells: list[Cell]) -> Table:
     """How a sweep was made: its commands, how long it trained, versions and hardware."""
     trainings = [cell.scores.training for cell in cells if cell.scores]
     spent = duration(sum(training.seconds for training in trainings))
-    made_with = Counter(", ".join(f"{k} {v}" for k, v in one.made_with.items()) for one in trainings)
+    made_with = Counter(", ".join(f"{k} {v}" for k, v in run.made_with.items()) for run in trainings)
     lines = [["command", command] for command in commands]
     lines.append(["trainings", f"{len(trainings)} of {len(cells)} done, {spent} in all"])
     lines += [[f"{count} of them with", words or "not written down"] for words, count in made_with.items()]
@@ -125,11 +118,9 @@ def _scores(group: Group, role: str, title: str, quantities: dict[str, str], abo
 
 
 def _settings(group: Group) -> Table | None:
-    rows = [row for row in group.rows if row.done]
-    lines = sorted(
-        (key, *values) for key, values in differing([settings_of(row.done[0]) for row in rows]).items()
-    )
-    frame = pd.DataFrame(lines, columns=["setting", *(row.label for row in rows)])
+    rows = {row.label: settings_of(row.first) for row in group.rows if row.first}
+    lines = sorted((key, *values) for key, values in differing(list(rows.values())).items())
+    frame = pd.DataFrame(lines, columns=["setting", *rows])
     return Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True) if lines else None
 
 
@@ -137,10 +128,9 @@ def _costs(group: Group) -> Table:
     lines = group.costs.reindex([row.label for row in group.rows])
     names = {"shapes": "trained_on"} | {name: name for name in ("parameters", "epochs", "steps", "samples")}
     columns = {k: [NONE if pd.isna(n) else f"{n:,.0f}" for n in lines[name]] for k, name in names.items()}
-    times = zip(lines["seconds"], lines["seconds_ci95"], strict=True)
     columns["training time"] = [
         NONE if pd.isna(mean) else duration(mean) + (f" ± {duration(half)}" if half > 0 else "")
-        for mean, half in times
+        for mean, half in zip(lines["seconds"], lines["seconds_ci95"], strict=True)
     ]
     return Table("Cost", _frame(group, columns), ABOUT_COSTS)
 
@@ -192,7 +182,22 @@ def markdown(title: str, tables: list[Table]) -> str:
     return "\n".join(parts)
 
 
-def _escaped(table: Table, escape, bold: str) -> pd.DataFrame:
+def latex(sections: list[tuple[str, list[Table]]]) -> str:
+    """A document of titled tables that compiles; each table can be copied out (booktabs)."""
+    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs,graphicx}"]
+    lines += [r"\usepackage[landscape,margin=1.5cm]{geometry}", r"\begin{document}"]
+    for title, tables in sections:
+        for table in tables:
+            frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
+            form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
+            lines += [r"\begin{table}[p]\centering", rf"\caption{{{_latex_text(f'{table.title}: {title}')}}}"]
+            lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
+            lines += [frame.to_latex(index=False, escape=False, column_format=form) + "}"]
+            lines += [rf"\par\smallskip\footnotesize {_latex_text(table.note)}", r"\end{table}"]
+    return "\n".join([*lines, r"\end{document}", ""])
+
+
+def _escaped(table: Table, escape: Callable[[str], str], bold: str) -> pd.DataFrame:
     frame = table.frame.map(escape).set_axis(list(map(escape, table.frame.columns)), axis=1)
     for row, column in table.best:
         frame.iat[row, column] = bold.format(frame.iat[row, column])
@@ -210,18 +215,3 @@ LATEX |= {"^": r"\textasciicircum{}", "~": r"\textasciitilde{}"} | {c: f"\\{c}" 
 def _latex_text(text: str) -> str:
     """Text that LaTeX prints as it is; question marks for characters that its fonts may lack."""
     return "".join(LATEX.get(c, c if c.isascii() and c.isprintable() else "?") for c in str(text))
-
-
-def latex(sections: list[tuple[str, list[Table]]]) -> str:
-    """A document of titled tables that compiles; each table can be copied out (booktabs)."""
-    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs,graphicx}"]
-    lines += [r"\usepackage[landscape,margin=1.5cm]{geometry}", r"\begin{document}"]
-    for title, tables in sections:
-        for table in tables:
-            frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
-            form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
-            lines += [r"\begin{table}[p]\centering", rf"\caption{{{_latex_text(f'{table.title}: {title}')}}}"]
-            lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
-            lines += [frame.to_latex(index=False, escape=False, column_format=form) + "}"]
-            lines += [rf"\par\smallskip\footnotesize {_latex_text(table.note)}", r"\end{table}"]
-    return "\n".join([*lines, r"\end{document}", ""])

@@ -12,8 +12,7 @@ from sdfhub.geometry.mesh_file import write_mesh, write_row
 from sdfhub.geometry.render import render
 from sdfhub.space import Space, reconstruct
 
-COLUMNS = 8
-"""Pictures side by side where there is no order in them."""
+COLUMNS = 8  # pictures side by side where there is no order in them
 
 
 def write_gallery(
@@ -24,27 +23,23 @@ def write_gallery(
     All lie in the normalised frame: a code between two shapes, or a new one, has no source.
 
     Args:
-        space: of the codes.
-        codes: [S, L].
+        space, codes: a space and S of its codes [S, L].
         captions: S texts below which the pictures stand, of one or two lines.
         out: folder of the results.
         resolution: points along an axis of the marching-cubes grid, >= 2.
         animated: whether the codes are steps of a way, which then stays in one line.
     """
-    found = reconstruct(space.decoder, codes, resolution)
-    bar = tqdm(found, total=len(codes), desc="meshing", unit="shape", leave=False, disable=None)
-    meshes = list(bar)
+    results = reconstruct(space.decoder, codes, resolution)
+    meshes = list(tqdm(results, "meshing", len(codes), leave=False, disable=None))
     pictures = [render(*mesh, up=space.up) for mesh in meshes]
-    shown = [
-        picture if len(mesh[1]) else "no surface" for picture, mesh in zip(pictures, meshes, strict=True)
-    ]
+    shown = [p if len(mesh.faces) else "no surface" for p, mesh in zip(pictures, meshes, strict=True)]
     columns = len(shown) if animated else COLUMNS
     rows = [shown[start : start + columns] for start in range(0, len(shown), columns)]
     contact_sheet(rows, [], captions, out / "strip.png")
     for stale in (out / "meshes").glob("[0-9][0-9][0-9].ply"):  # of a longer row
         stale.unlink()
     for index, mesh in enumerate(meshes):
-        write_mesh(*mesh, out / "meshes" / f"{index:03d}.ply")
+        write_mesh(mesh.vertices, mesh.faces, out / "meshes" / f"{index:03d}.ply")
     write_row(meshes, space.up, out / "meshes.glb")
     if animated:
         animation(pictures, out / "animation.gif")

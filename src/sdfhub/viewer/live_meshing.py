@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any
 
 from torch import Tensor
@@ -16,18 +17,11 @@ from sdfhub.model.fast.computing import distances
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """A mesh of a code that was asked for.
+    """A mesh in the normalised frame of a code that was asked for, empty without a surface, `seconds` ago."""
 
-    Args:
-        about: what was handed over with the code.
-        mesh: normalised frame; empty where the field has no zero level.
-        resolution: points along an axis of its grid.
-        seconds: since it was asked for.
-    """
-
-    about: Any
+    about: Any  # what was handed over with the code
     mesh: Mesh
-    resolution: int
+    resolution: int  # points along an axis of its grid
     seconds: float
 
 
@@ -47,34 +41,25 @@ class LiveMesher:
         self, decoder: Decoder, resolutions: Sequence[int], show: Callable[[Meshed | SdfhubError], None]
     ):
         self.decoder, self.resolutions, self.show = decoder, tuple(resolutions), show
-        self._latest: tuple[Tensor, Any, float] | None = None
-        self._is_open = True
-        self._changed = threading.Condition()
+        self._requests: SimpleQueue[tuple[Tensor, Any, float] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="mesher", daemon=True)
         self._thread.start()
 
     def ask(self, code: Tensor, about: Any = None) -> None:
         """Wants the surface of a code [L]; whatever was asked before is no longer wanted."""
-        with self._changed:
-            self._latest = (code, about, time.perf_counter())
-            self._changed.notify()
+        self._requests.put((code, about, time.perf_counter()))
 
     def close(self) -> None:
         """Ends the thread."""
-        with self._changed:
-            self._is_open = False
-            self._changed.notify()
+        self._requests.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._latest is not None or not self._is_open)
-                if not self._is_open:
-                    return
-                (code, about, asked), self._latest = self._latest, None
+        while request := self._requests.get():
+            if not self._requests.empty():
+                continue
             try:
-                self._refine(code, about, asked)
+                self._refine(*request)
             except _Outdated:
                 pass
             except SdfhubError as error:
@@ -86,7 +71,7 @@ class LiveMesher:
         for index, resolution in enumerate(self.resolutions):
 
             def fields(points: Tensor, shapes: Tensor, is_first: bool = index == 0) -> Tensor:
-                if not is_first and (self._latest is not None or not self._is_open):
+                if not (is_first or self._requests.empty()):
                     raise _Outdated
                 return distances(self.decoder, points, code[None].expand(len(shapes), -1))
 

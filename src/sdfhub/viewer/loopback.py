@@ -1,7 +1,7 @@
 """viser's server for one person on one machine: what it answers, to whom, and what it takes from a page.
 
 viser listens to all pages of all browsers that reach it, serves files by path, opens a tunnel to a public
-server when a page asks for one, lets a page set any attribute of a control, and holds whatever is uploaded.
+server when a page asks for one, lets a page set any attribute of a control, and takes files of any size.
 Here a page comes from this server on a loopback address or is refused, there is one file to read, and of
 messages only those pass that the page needs.
 """
@@ -24,26 +24,24 @@ from websockets.http11 import Request, Response
 from sdfhub.errors import SdfhubError
 
 HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")
-"""What a browser may call this machine."""
-
+NAMES = (HOST, "localhost")  # what a browser may call this machine
 MAX_UPLOAD = 64 << 20
 """Bytes of an uploaded file. A larger one, or one of another type, arrives as an empty one."""
 
-PART = 512 << 10
-"""Bytes of the parts in which viser's page sends a file."""
+PART = 512 << 10  # bytes of the parts in which viser's page sends a file
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
+    "style-src 'unsafe-inline'; img-src blob: data:; font-src data:; connect-src ws://{host} blob: data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""What the page may load: itself, and from nowhere but here."""
 
 _QUIET = logging.getLogger(__name__)
 _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, and none for a traceback
 
 
 class LoopbackServer(viser.ViserServer):
-    """viser behind a gate.
-
-    Args:
-        port: to listen on; 0 takes a free one.
-        label: of the page's panel.
-        suffixes: of files that may be uploaded, in lower case.
+    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one.
 
     Raises:
         SdfhubError: the port is taken.
@@ -54,14 +52,13 @@ class LoopbackServer(viser.ViserServer):
             socket.create_server((HOST, port)).close()
         except OSError as error:
             raise SdfhubError(f"port={port}: is taken or not allowed; 0 takes a free one") from error
-
         plain = sockets.serve
-        sockets.serve = partial(_Serve, suffixes)  # viser has no option for what a gate needs
+        sockets.serve = partial(_Serve, suffixes)  # type: ignore[misc, assignment]  # viser has no option for it
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 super().__init__(host=HOST, port=port, label=label, verbose=False)
         finally:
-            sockets.serve = plain
+            sockets.serve = plain  # type: ignore[misc]
 
     def stop(self) -> None:
         """Ends it, without viser's announcement."""
@@ -78,86 +75,58 @@ def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
     if len(hosts) != 1 or hosts[0].partition(":")[0] not in NAMES:
         return http.HTTPStatus.FORBIDDEN, "This page is for its own machine: open it at http://127.0.0.1\n"
-    is_socket = "Upgrade" in request.headers
-    if origins != [f"http://{hosts[0]}"] and (is_socket or origins):
+    if origins != [f"http://{hosts[0]}"] and ("Upgrade" in request.headers or origins):
         return http.HTTPStatus.FORBIDDEN, "This page is for itself\n"
     if request.path.partition("?")[0] != "/":
         return http.HTTPStatus.NOT_FOUND, "There is one page here: /\n"
     return None
 
 
-def policy(host: str) -> str:
-    """What the page may load: itself, and from nowhere but here."""
-    return (
-        "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
-        "style-src 'unsafe-inline'; img-src blob: data:; font-src data:; "
-        f"connect-src ws://{host} blob: data:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
+def passed(raw: bytes, suffixes: Collection[str]) -> bytes | None:
+    """A page's message as viser shall see it; None where it shall not.
+
+    Values of controls, the camera and parts of files pass; a file too large or of another type arrives empty.
+    """
+    try:
+        message: dict[str, Any] = msgspec.msgpack.decode(raw)
+        kind = message["type"]
+        if kind == "FileTransferStartUpload":
+            size, parts = message["size_bytes"], message["part_count"]
+            is_known = str(message["filename"]).lower().endswith(tuple(suffixes))
+            if not is_known or not 0 < size <= MAX_UPLOAD or parts != math.ceil(size / PART):
+                return msgspec.msgpack.encode(message | {"size_bytes": 0, "part_count": 0})
+            return raw
+        is_part = kind == "FileTransferPart" and len(message["content"]) <= PART
+        is_value = kind == "GuiUpdateMessage" and message["updates"].keys() == {"value"}
+        return raw if is_part or is_value or kind == "ViewerCameraMessage" else None
+    except (msgspec.DecodeError, LookupError, TypeError, AttributeError, ValueError, OverflowError):
+        return None
 
 
 class _Serve(sockets.serve):
     """websockets' server with a gate before viser's own answers."""
 
-    def __init__(self, suffixes: Collection[str], *arguments, process_request, **options):
+    def __init__(self, suffixes: Collection[str], *arguments: Any, process_request: Any, **options: Any):
         def answer(connection: sockets.ServerConnection, request: Request) -> Response | None:
             refused = refusal(request)
             response = connection.respond(*refused) if refused else process_request(connection, request)
             if response is not None:
-                response.headers["Content-Security-Policy"] = policy(request.headers.get("Host", HOST))
+                policy = POLICY.format(host=request.headers.get("Host", HOST))
+                response.headers["Content-Security-Policy"] = policy
             return response
 
         options |= {"create_connection": partial(_Gated, suffixes), "max_size": 2 * PART, "logger": _QUIET}
         super().__init__(*arguments, process_request=answer, **options)
 
 
-class Gate:
-    """Lets messages of one page pass: values of controls, the camera, one bounded upload at a time."""
-
-    def __init__(self, suffixes: Collection[str]):
-        self.suffixes = suffixes
-        self._uploading: str | None = None
-        self._missing: set[int] = set()
-
-    def passed(self, raw: bytes) -> bytes | None:
-        """A message as viser shall see it, or None where it shall not."""
-        try:
-            message = msgspec.msgpack.decode(raw)
-            kind = message["type"]
-            if kind == "FileTransferStartUpload":
-                return msgspec.msgpack.encode(self._bounded(message))
-            if kind == "FileTransferPart":
-                return raw if self._is_missing(message) else None
-            is_value = kind == "GuiUpdateMessage" and message["updates"].keys() == {"value"}
-            return raw if is_value or kind == "ViewerCameraMessage" else None
-        except (msgspec.DecodeError, LookupError, TypeError, AttributeError, ValueError, OverflowError):
-            return None
-
-    def _bounded(self, message: dict[str, Any]) -> dict[str, Any]:
-        size, parts = int(message["size_bytes"]), int(message["part_count"])
-        is_known = str(message["filename"]).lower().endswith(tuple(self.suffixes))
-        if self._missing or not is_known or not 0 < size <= MAX_UPLOAD or parts != math.ceil(size / PART):
-            return message | {"size_bytes": 0, "part_count": 0}
-        self._uploading, self._missing = message["transfer_uuid"], set(range(parts))
-        return message | {"size_bytes": size, "part_count": parts}
-
-    def _is_missing(self, message: dict[str, Any]) -> bool:
-        index, content = message["part_index"], message["content"]
-        if message["transfer_uuid"] != self._uploading or index not in self._missing or len(content) > PART:
-            return False
-        self._missing.remove(index)
-        return True
-
-
 class _Gated(sockets.ServerConnection):
     """A page's connection, of which viser sees only what passes."""
 
-    def __init__(self, suffixes: Collection[str], *arguments, **options):
+    def __init__(self, suffixes: Collection[str], *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
-        self._gate = Gate(suffixes)
+        self._suffixes = suffixes
 
-    async def recv(self, decode: bool | None = None) -> bytes:
+    async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
         while True:
-            raw = await super().recv(decode=False)
-            if (passed := self._gate.passed(raw)) is not None:
-                return passed
+            if (message := passed(await super().recv(decode=False), self._suffixes)) is not None:
+                return message

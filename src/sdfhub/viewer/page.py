@@ -1,38 +1,40 @@
-"""A page on which the shapes of a space can be seen, turned, moved, mixed, and fitted to a scan.
+"""A page of shapes to see, turn, mix and fit to a scan.
 
-What is shown is a code: between the shapes A and B, moved along the principal directions of the codes.
+A code is shown: between the shapes A and B, moved along the principal directions of the codes.
 """
 
 import html
 import threading
-from collections.abc import Sequence
 from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.up_axis import turned_up
+from sdfhub.scans import scan as scans
+from sdfhub.scans.observed_scan import observe
+from sdfhub.scans.scan import Scan, read_scan
 from sdfhub.space import Space
-from sdfhub.viewer.dropped_scan import FORMATS, fit_scan
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
 
-DIRECTIONS, REACH = 6, 3.0
-"""Sliders along principal directions, and how far they go, in standard deviations."""
+FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
+"""Meshes and clouds of a whole shape. Archives also carry views and samples, whose frame has to be said."""
 
+POINTS = 4000  # points of a scan's surface that are shown
+DIRECTIONS, REACH = 6, 3.0  # sliders along principal directions, and how far they go, in standard deviations
 RUNGS = (64, 128)
 """Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
 
-FAR = 0.03
-"""Mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves."""
-
-STRANGE = 2.0
-"""Times as unusual as the most unusual of the space's own codes: no shape of its kind."""
-
+FAR = 0.03  # mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves
+STRANGE = 2.0  # times as unusual as the most unusual of the space's own codes: no shape of its kind
 MEAN = "(mean of all shapes)"
-EYE_AND_AIM = [[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]]
+EYE_AND_AIM = np.array([[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]])
 """Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
 
 CLAY, SCAN = (201, 131, 92), (42, 92, 170)
@@ -40,13 +42,7 @@ STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
 
 class Viewer:
-    """The page and what it does.
-
-    Args:
-        space: whose shapes are shown.
-        title: what the space is called.
-        port: on this machine; 0 takes a free one.
-        resolution: points along an axis of the grid when nothing moves.
+    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves.
 
     Attributes:
         shapes: codes [L] by the names under which the page offers them.
@@ -54,12 +50,13 @@ class Viewer:
     """
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
-        self.space, self.scans = space, {}
+        self.space = space
+        self.scans: dict[str, np.ndarray] = {}
         self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
         self.axes = space.principal_directions[:DIRECTIONS]
         self.drawn, self._reading, self._fitting = threading.Event(), threading.Lock(), threading.Lock()
         self.server = LoopbackServer(port, "sdfhub", FORMATS)
-        self._furnish()
+        self._add_scene()
         self._add_controls(title)
         rungs = [*(rung for rung in RUNGS if rung < resolution), resolution]
         self.mesher = LiveMesher(space.decoder, rungs, self._draw)
@@ -73,13 +70,13 @@ class Viewer:
     def refresh(self) -> None:
         """Asks for the surface of what the controls say."""
         with self._reading:  # viser calls from many threads: what is asked for last was read last
-            names, share = (self.a.value, self.b.value), bounded(self.share.value, 0.0, 1.0)
-            steps = [bounded(slider.value, -REACH, REACH) for slider in self.sliders]
-            if set(names) <= self.shapes.keys():
-                a, b = (self.shapes[name] for name in names)
-                name = names[0] if share == 0 else f"{names[0]} → {names[1]}, {share:.2f}"
-                name += ", moved" * any(steps)
-                self.mesher.ask(moved(torch.lerp(a, b, share), self.axes, steps), name)
+            a, b, share = self.a.value, self.b.value, bounded(self.share.value, 0.0, 1.0)
+            steps = torch.tensor([bounded(slider.value, -REACH, REACH) for slider in self.sliders])
+            if a in self.shapes and b in self.shapes:
+                name = a if share == 0 else f"{a} → {b}, {share:.2f}"
+                name += ", moved" * bool(steps.any())
+                code = torch.lerp(self.shapes[a], self.shapes[b], share)
+                self.mesher.ask(code + steps.to(code) @ self.axes, name)
 
     def reset(self) -> None:
         """Back to the shape A itself."""
@@ -92,48 +89,46 @@ class Viewer:
         """Fits a scan, offers it beside the shapes and shows it; says why where that fails."""
         name = shown_name(name)
         if not self._fitting.acquire(blocking=False):
-            return self._say("One scan at a time: another is being fitted.")
+            return self._show_message("One scan at a time: another is being fitted.")
         try:
             if not content:  # what the gate cut off arrives so
                 raise SdfhubError(f"{name}: empty, larger than {MAX_UPLOAD >> 20} MiB or of another type")
-            self._say(f"Fitting {name} …")
+            self._show_message(f"Fitting {name} …")
             code, surface = fit_scan(self.space, name, content)
-            self._say(f"{name}: {self._judged(code, surface)}")
-            self.name.content = told(name, "name") + told("meshing …", "small")
+            self._show_message(f"{name}: {self._quality(code, surface)}")
+            self.name.content = paragraph(name, "name") + paragraph("meshing …", "small")
             self.shapes[name], self.scans[name] = code, surface
             self.a.options = self.b.options = tuple(self.shapes)
             self.a.value = name
             self.reset()
         except SdfhubError as error:
-            self._say(f"{error}", is_wrong=True)
+            self._show_message(str(error), "wrong")
         finally:
             self._fitting.release()
 
-    def _judged(self, code: Tensor, surface: np.ndarray) -> str:
+    def _quality(self, code: Tensor, surface: np.ndarray) -> str:
         """How well a code fits the points of a scan's surface, and whether it is one of this space."""
         with torch.no_grad():
-            off = float(self.space.sdf(surface, code).abs().mean())
-        said = f"the scan's surface is {off:.4f} off the fitted one, on average of a size of 2."
-        if off > FAR:
-            return f"{said} Doubtful: that is far."
+            distance = float(self.space.sdf(surface, code).abs().mean())
+        text = f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2."
+        if distance > FAR:
+            return f"{text} Doubtful: that is far."
         if self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max():
-            return f"{said} Doubtful: its code is unlike those of this space's shapes."
-        return said
+            return f"{text} Doubtful: its code is unlike those of this space's shapes."
+        return text
 
-    def _draw(self, found: Meshed | SdfhubError) -> None:
-        if isinstance(found, SdfhubError):
-            self.name.content = told(str(found), "wrong")
-            self.drawn.set()
-            return
-        (vertices, faces), milliseconds = found.mesh, round(1000 * found.seconds)
-        with self.server.atomic():
-            self.mesh.visible = bool(len(faces))
-            if len(faces):
-                self.mesh.vertices, self.mesh.faces = vertices, faces
-            what = f"{len(faces):,} triangles, {found.resolution}³, {milliseconds} ms"
-            self.name.content = told(found.about, "name") + told(
-                what if len(faces) else "no surface", "small"
-            )
+    def _draw(self, meshed: Meshed | SdfhubError) -> None:
+        if isinstance(meshed, SdfhubError):
+            self.name.content = paragraph(str(meshed), "wrong")
+        else:
+            vertices, faces = meshed.mesh
+            size = f"{len(faces):,} triangles, {meshed.resolution}³, {round(1000 * meshed.seconds)} ms"
+            with self.server.atomic():
+                self.mesh.visible = bool(len(faces))
+                if len(faces):
+                    self.mesh.vertices, self.mesh.faces = vertices, faces
+                text = paragraph(size if len(faces) else "no surface", "small")
+                self.name.content = paragraph(meshed.about, "name") + text
         self.drawn.set()
 
     def _show_scan(self) -> None:
@@ -144,33 +139,33 @@ class Viewer:
             if points is not None:
                 self.scan.points = points
 
-    def _say(self, text: str, is_wrong: bool = False) -> None:
-        self.message.content = told(text, "wrong" if is_wrong else "small")
+    def _show_message(self, text: str, kind: str = "small") -> None:
+        self.message.content = paragraph(text, kind)
 
-    def _furnish(self) -> None:
+    def _add_scene(self) -> None:
         scene, up = self.server.scene, self.space.up
-        scene.set_up_direction(f"+{up}")
+        scene.set_up_direction("+z" if up == "z" else "+y")
         camera = self.server.initial_camera
         camera.position, camera.look_at, camera.fov = *turned_up(EYE_AND_AIM, "z", up), 0.66
-        plane, (below,) = {"z": "xy", "y": "xz"}[up], turned_up([[0, 0, -1]], "z", up)
-        faint = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
-        scene.add_grid("/floor", 8, 8, plane=plane, position=below, **faint)
+        below = turned_up(np.array([[0, 0, -1]]), "z", up)[0]
+        faint: Any = {"cell_color": (233, 233, 233), "section_color": (222, 222, 222), "fade_distance": 9.0}
+        scene.add_grid("/floor", 8, 8, plane="xy" if up == "z" else "xz", position=below, **faint)
         nothing = np.zeros((3, 3))
         self.mesh = scene.add_mesh_simple("/shape", nothing, np.array([[0, 1, 2]]), color=CLAY, side="double")
-        self.scan = scene.add_point_cloud(
-            "/scan", nothing, SCAN, point_size=0.008, point_shape="circle", visible=False
-        )
+        dots: Any = {"point_size": 0.008, "point_shape": "circle", "visible": False}
+        self.scan = scene.add_point_cloud("/scan", nothing, SCAN, **dots)
 
     def _add_controls(self, title: str) -> None:
-        gui, space = self.server.gui, self.space
+        gui, space, names = self.server.gui, self.space, tuple(self.shapes)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=CLAY)
         size = f"{len(space.ids)} shapes, codes of {space.codes.shape[1]} numbers"
-        gui.add_html(f"<style>{STYLE}</style>" + told(title, "title") + told(size, "small"))
-        self.name = gui.add_html(told("…", "name"))
+        gui.add_html(f"<style>{STYLE}</style>" + paragraph(title, "title") + paragraph(size, "small"))
+        self.name = gui.add_html(paragraph("…", "name"))
         with gui.add_folder("Shape"):
-            self.a = gui.add_dropdown("A", tuple(self.shapes), hint="What is shown; type to search")
-            self.b = gui.add_dropdown("B", tuple(self.shapes), initial_value=tuple(self.shapes)[1])
-            self.share = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint="On the line between their codes")
+            self.a: Any = gui.add_dropdown("A", names, hint="What is shown; type to search")
+            self.b: Any = gui.add_dropdown("B", names, initial_value=names[1])
+            hint = "On the line between their codes"
+            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint=hint)
         with gui.add_folder("Principal directions"):
             hint = "Standard deviations of the codes along this axis; 0 is the shape above"
             axes = range(1, len(self.axes) + 1)
@@ -178,8 +173,8 @@ class Viewer:
             reset = gui.add_button("Back to A", color="gray")
         with gui.add_folder("Fit a scan"):
             upload = gui.add_upload_button("Drop a scan here, or click", mime_type=",".join(FORMATS))
-            what = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
-            self.message = gui.add_html(told(what, "small"))
+            kinds = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
+            self.message = gui.add_html(paragraph(kinds, "small"))
             self.overlay = gui.add_checkbox("Show the scan's points", True, visible=False)
         self.a.on_update(lambda _: self.reset())
         for control in (self.b, self.share, *self.sliders):
@@ -189,9 +184,37 @@ class Viewer:
         upload.on_upload(lambda _: self.fit(upload.value.name, upload.value.content))
 
 
-def moved(code: Tensor, axes: Tensor, steps: Sequence[float]) -> Tensor:
-    """A code [L] moved by steps along axes [K, L]."""
-    return code + torch.tensor(steps, dtype=code.dtype, device=code.device) @ axes
+def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
+    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame.
+
+    The file's name is for messages and its suffix; nothing is opened under it.
+
+    Raises:
+        SdfhubError: names the file and what is wrong with it.
+    """
+    suffix = PurePath(name).suffix.lower()
+    if suffix not in FORMATS:
+        raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
+    rng = np.random.default_rng(0)
+    with TemporaryDirectory() as folder:  # a .gltf can name files of its folder: there are none
+        path = Path(folder) / f"scan{suffix}"
+        path.write_bytes(content)
+        try:
+            scan = read_scan(path)
+            observed = observe(scan, space.evidence, "shape", rng)
+            code = space.fit_observations([observed.observation]).codes[0]
+        except (SdfhubError, ValueError) as error:
+            reason = str(error).replace(str(path), name)
+            raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
+    return code, observed.frame.to_normalized(surface_points(scan, rng)).astype(np.float32)
+
+
+def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
+    """At most POINTS points [M, 3] of a scan's surface, in its frame: all over a mesh, or of a cloud."""
+    if scan.faces is None:
+        return scan.points[rng.permutation(len(scan.points))[:POINTS]]
+    mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])
 
 
 def bounded(value: float, low: float, high: float) -> float:
@@ -205,6 +228,6 @@ def shown_name(name: str) -> str:
     return "".join(letter for letter in last if letter.isprintable())[-60:]
 
 
-def told(text: str, kind: str) -> str:
+def paragraph(text: str, kind: str) -> str:
     """A paragraph of plain text for the page."""
     return f'<p class="sdfhub-{kind}">{html.escape(text)}</p>'
