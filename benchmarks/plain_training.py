@@ -10,6 +10,7 @@ judging stay sdfhub's. `accuracy.py` runs it beside `train.py`; a test holds the
 import sdfhub  # noqa: F401  (before torch: it says how threads wait)
 
 # isort: split
+import sys
 from itertools import zip_longest
 
 import torch
@@ -22,7 +23,7 @@ from sdfhub.model.conditioning import Concat
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.pieces import Parts
 from sdfhub.shapes import Batch
-from sdfhub.tasks.train import main as train
+from sdfhub.tasks.command import main as command
 
 
 def field(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
@@ -59,7 +60,8 @@ def objective(model: AutoDecoder, batch: Batch, progress: float) -> tuple[Tensor
 
 def main() -> None:
     AutoDecoder.objective = objective
-    train()
+    sys.argv.insert(1, "train")
+    command()
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ def prepared_lamps(count: int, run: Path) -> list[StoredShape]:
     """Lamps, prepared as the run's own shapes were."""
     source, data = ProceduralSource({"lamps": {}}), data_of(read_run(run)[0])
     shapes = split(source.shapes(), 0, count, seed=4).held_out
-    return list(prepare(source, shapes, data.preparation, data.store, workers=1).values())
+    return list(prepare(source, shapes, data.preparation, Path(data.store), workers=1).values())
 
 
 def moved(scan: Scan, shape: StoredShape) -> tuple[Scan, np.ndarray]:

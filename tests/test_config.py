@@ -1,5 +1,7 @@
 """Every choice of conf/ composes and builds; mistakes are refused in one line, before a shape is prepared."""
 
+import copy
+
 import pytest
 import torch
 from hydra.errors import HydraException
@@ -9,6 +11,7 @@ from sdfhub.composition import configuration_folder, instantiate, plain
 from sdfhub.errors import SdfhubError
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.opening import with_environment
+from sdfhub.settings import flat
 from sdfhub.tasks.train import make_parts
 from tests.tiny import composed, run_command
 
@@ -105,6 +108,19 @@ def test_a_mistake_is_one_line_that_names_it(word, monkeypatch, capsys, tmp_path
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("sdfhub: error: ") and MISTAKES[word] in lines[-1], lines
     assert not list(tmp_path.rglob("*.safetensors")), "nothing was prepared"
+
+
+@pytest.mark.parametrize("group", ["decoder", "loss", "data", "fit", "evaluate", "validation"])
+def test_a_number_that_is_none_and_a_negative_count_are_named(group):
+    config = composed()
+    written = OmegaConf.to_container(config[group])  # what another group fills in stands there as text
+    for key, value in flat(written).items():
+        if type(value) in (int, float) and not key.endswith("seed"):
+            for wrong in ("abc", float("nan") if isinstance(value, float) else -3):
+                changed = copy.deepcopy(config)
+                OmegaConf.update(changed, f"{group}.{key}", wrong)
+                with pytest.raises(SdfhubError, match=key.rpartition(".")[2]):
+                    instantiate(changed[group], group)
 
 
 @pytest.mark.parametrize("word", ["activation=hosk", "activation.betta=3", "foo=3", "seed=0,1"])
