@@ -344,7 +344,7 @@ STRANGERS = {
     "an id that leads out": (lambda a, t: a.update(ids=["../../x", *IDS[1:]]), "shape id"),
     "an id that is no text": (lambda a, t: a.update(ids=[1, 2, 3, 4]), "shape id"),
     "the same id twice": (lambda a, t: a.update(ids=[IDS[0], *IDS[:3]]), "must differ"),
-    "a frame without size": (lambda a, t: a.update(frames={IDS[0]: [0, 0, 0, 0]}), "scale positive"),
+    "a frame without size": (lambda a, t: a.update(frames={IDS[0]: [0, 0, 0, 0]}), "positive scale"),
     "a frame of text": (lambda a, t: a.update(frames={IDS[0]: "here"}), "not a shape space"),
     "no metrics": (lambda a, t: a.pop("metrics"), "not a readable export"),
     "a third axis": (lambda a, t: a.update(up="x"), "up: must be"),

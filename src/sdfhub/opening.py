@@ -198,7 +198,8 @@ def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
         codes = tensors.pop("codes")
         weights = {name.removeprefix("decoder."): tensor for name, tensor in tensors.items()}
-        return about, weights, codes
+        names = ("model", "config", "ids", "frames", "up", "metrics")
+        return {name: about[name] for name in names}, weights, codes
     except SdfhubError:
         raise
     except Exception as error:  # the reader knows a dozen kinds of damage

@@ -118,8 +118,8 @@ def _hoop(chair) -> list[Manifold]:
     heights = chair.back_height * np.sin(angle) ** power
     path = [point(chair, s, h) for s, h in zip(sides, heights, strict=True)]
     root = np.array([0, 0, -0.5 * chair.seat_thickness])
-    path = np.array([path[0] + root, *path, path[-1] + root])
-    made = [parts.tube(path, max(0.42 * chair.leg_width, 0.0125), 12, up=(0, 1, 0))]
+    bow = np.array([path[0] + root, *path, path[-1] + root])
+    made = [parts.tube(bow, max(0.42 * chair.leg_width, 0.0125), 12, up=(0, 1, 0))]
     rod = chair.spindle_width / 2 * parts.circle(10)
     for side in _inner_sides(chair):
         top = chair.back_height * (1 - abs(side) ** 2.6) ** (1 / 2.6)

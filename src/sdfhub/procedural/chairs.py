@@ -165,7 +165,7 @@ class Chair:
         seat = np.array([x, y, self.seat_height - 0.4 * self.seat_thickness])
         wide = max(x, behind[0]) + 0.02
         if self.arms == "curved":
-            corners = [behind, (wide, 0.3 * y, z + 0.01), (wide, y - 0.05, z - 0.01), seat]
+            corners: list[parts.Point] = [behind, (wide, 0.3 * y, z + 0.01), (wide, y - 0.05, z - 0.01), seat]
             path = parts.filleted(corners, 0.06, 5)
             return parts.mirrored(parts.tube(path, 0.4 * self.leg_width, up=(1, 0, 0.2)))
         rest = parts.plank(behind + [0, 0.01, 0], (x, y - 0.05, z), 0.045, 0.024)

@@ -31,9 +31,9 @@ def _rod(bottom: float, top: float, radius: float) -> Manifold:
 def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold]:
     """A bulb and its socket; `up` tells on which side of the socket the bulb is."""
     sign = 1 if up else -1
-    ends = sorted([centre, centre - sign * 1.75 * radius])
+    low, high = sorted([centre, centre - sign * 1.75 * radius])
     socket = max(0.55 * radius, 1.5 * gauge)
-    return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), _rod(*ends, socket)]
+    return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), _rod(low, high, socket)]
 
 
 def _radius(lamp, share: np.ndarray) -> np.ndarray:

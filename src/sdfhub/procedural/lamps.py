@@ -129,7 +129,12 @@ class Lamp:
         end = np.array([0, -self.reach * 0.8 * tall, 0.86 * tall])
         made = self._plinth_or_block()
         if self.arm == "bent":
-            corners = [start, start + [0, 0.02, 0.6 * tall], (0, 0.5 * end[1], 1.12 * tall), end]
+            corners: list[parts.Point] = [
+                start,
+                start + [0, 0.02, 0.6 * tall],
+                (0, 0.5 * end[1], 1.12 * tall),
+                end,
+            ]
             made.append(parts.tube(parts.filleted(corners, 0.16 * tall, 8), 1.2 * g, up=(1, 0, 0)))
         else:
             offsets = (-1.9 * g, 1.9 * g) if self.arm == "paired" else (0.0,)

@@ -197,14 +197,14 @@ def arc(start: Point, end: Point, bulge: Point, count: int = 9) -> np.ndarray:
 
 def filleted(corners: Sequence[Point], radius: float, steps: int = 4) -> np.ndarray:
     """[K, 3] polyline through `corners` with its bends rounded by about `radius`."""
-    corners = np.asarray(corners, float)
-    path = [corners[0]]
-    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
+    points = np.asarray(corners, float)
+    path = [points[0]]
+    for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
         start = corner + radius * _unit(before - corner)
         end = corner + radius * _unit(after - corner)
         t = np.linspace(0, 1, steps + 1)[:, None]
         path.extend((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
-    return np.array([*path, corners[-1]])
+    return np.array([*path, points[-1]])
 
 
 def spokes(count: int, first: float = -0.5) -> list[np.ndarray]:

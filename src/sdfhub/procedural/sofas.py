@@ -183,8 +183,8 @@ class Sofa:
         w, z = self.leg_width, self.leg_height + 0.025
         inset = 0.05 + 0.5 * w
         towards = np.array([np.sign(corner[0]), 1.0 if corner[1] > 0 else -1.0])
-        if corner[1] < self.front - 1e-9:
-            left, right = self.chaise_span()
+        if corner[1] < self.front - 1e-9 and (span := self.chaise_span()):
+            left, right = span
             towards[0] = 1.0 if corner[0] > (left + right) / 2 else -1.0
         top = np.array([*(corner - inset * towards), z])
         foot = np.array([*(top[:2] + self.leg_splay * towards), 0.0])

@@ -6,7 +6,7 @@ import numpy as np
 
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points, pseudo_normal_signs
+from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
@@ -46,7 +46,7 @@ def prepare_mesh(
     normalized = normalize_mesh(vertices, faces, preparation)
     rng = np.random.default_rng(seed)
     surface = closed_surface(normalized) if preparation.sign == "winding" else None
-    signed = _signed_samples(surface, pseudo_normal_signs, preparation, rng) if surface else None
+    signed = _signed_samples(surface, SIGN_METHODS["pseudo_normal"], preparation, rng) if surface else None
     if not surface or not signed or not _winding_agrees(surface, signed[0], signed[1], rng):
         surface = visible_surface(normalized, preparation, rng)
         method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
