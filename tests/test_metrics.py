@@ -8,14 +8,7 @@ import torch
 import trimesh
 
 from sdfhub.geometry.mesher import mesh_dense
-from sdfhub.geometry.metrics import (
-    chamfer,
-    is_closed,
-    judge,
-    point_to_surface,
-    summarize,
-    volumetric_iou,
-)
+from sdfhub.geometry.metrics import chamfer, is_closed, judge, point_to_surface, summarize, volumetric_iou
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import Frame, NormalizedMesh
 

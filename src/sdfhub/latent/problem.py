@@ -145,7 +145,7 @@ class Problem:
         shapes, count = rows.low.shape
 
         def violation_of(copies: Tensor, *bounded: Tensor) -> Tensor:
-            single = Rows(*bounded, rows.soft, rows.prior)  # type: ignore[call-arg]
+            single = Rows(*[*bounded, *rows[4:]])
             if not self.has_pose:
                 return violation(self.decoder, copies, single, self.delta)[:, 0]
             pose = small_similarity(copies[:, self.size :])
