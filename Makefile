@@ -30,9 +30,10 @@ demo: install ## train HOSC + Fourier + normals on procedural chairs and print t
 test: $(DEV_STAMP) ## run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-lint: $(DEV_STAMP) ## check style
+lint: $(DEV_STAMP) ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 data: install ## fetch and unpack the real meshes of data=open into data/open (no root needed)
 	$(BIN)/python -m sdfhub.data.fetch
@@ -40,7 +41,7 @@ data: install ## fetch and unpack the real meshes of data=open into data/open (n
 BENCHMARKS := training growth procedural preparation large_mesh meshing evaluation fitting accuracy
 
 bench: install ## time all of it on this machine (a good half hour on two cores, 9 GB of disk meanwhile)
-	for each in $(BENCHMARKS); do printf "\n%s.py\n" $$each; $(BIN)/python benchmarks/$$each.py || exit 1; done
+	for name in $(BENCHMARKS); do printf "\n%s.py\n" $$name; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean: ## remove the environment; prepared data and runs stay
 	rm -rf $(VENV)
