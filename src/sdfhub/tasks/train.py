@@ -177,15 +177,14 @@ def make_trainer(
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
     ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
     ours["plugins"] = [WholeFileIO()]
-    given = {name: value for name, value in ours.items() if config.get(name) is None}
-    trainer = instantiate(config, "trainer", **given)
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
     # what hardware there is not, advertisements, defaults of Lightning's own files
     for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
         logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
-    return trainer
+    given = {name: value for name, value in ours.items() if config.get(name) is None}
+    return instantiate(config, "trainer", **given)
 
 
 def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
