@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, Field, PositiveFloat, PositiveInt, SkipValidation
+from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, SkipValidation
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -41,7 +41,7 @@ class Validation:
     resolution: Annotated[int, Field(ge=2)] = 64
     points: PositiveInt = 10_000
     delta: PositiveFloat = 0.1
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
     def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
         """The scores of one shape.

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -46,7 +46,7 @@ class DeepSdfFit:
     spread: NonNegativeFloat = 0.01
     lambda_code: NonNegativeFloat = 1e-4
     samples: PositiveInt | None = None
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
     @torch.enable_grad()
     def __call__(

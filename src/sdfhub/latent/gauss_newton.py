@@ -73,7 +73,7 @@ class GaussNewtonFit:
     smallest: PositiveFloat = 1e-3
     blurred: PositiveFloat = 1e-2
     damping: PositiveFloat = 10.0
-    seed: int = 0
+    seed: NonNegativeInt = 0
 
     @torch.no_grad()
     def __call__(
