@@ -57,11 +57,7 @@ class DeepSdfFit:
         delta: float,
         poses: PoseRange | None = None,
     ) -> Fitted:
-        """As `Fit` says.
-
-        Raises:
-            SdfhubError: the frame is unknown, or a side has no bounds tight enough to be samples.
-        """
+        """As `Fit` says; refuses an unknown frame, and a side with no bounds tight enough to be samples."""
         if poses:
             raise SdfhubError("fit=deepsdf: finds no poses; use fit=gauss_newton")
         sides = [_signed_sides(observation) for observation in observations]
@@ -79,12 +75,11 @@ class DeepSdfFit:
                 optimizer.zero_grad()
                 (loss * len(sides)).backward()  # the mean over shapes would shrink their gradients
                 optimizer.step()
-            fitted = fitted.detach()
             with torch.no_grad():
                 rows = [Rows.of([observation], delta, [0], codes.device) for observation in observations]
                 pairs = zip(fitted.split(1), rows, strict=True)
                 residuals = [violation(decoder, code, row, delta).abs().mean(1) for code, row in pairs]
-        return Fitted(fitted, torch.cat(residuals))
+        return Fitted(fitted.detach(), torch.cat(residuals))
 
     def _drawn(self, sides: tuple[Tensor, Tensor], step: int) -> Tensor:
         """A step's samples [per_step, 4] of a shape."""

@@ -13,11 +13,11 @@ AXES = {"y": 1, "z": 2}
 
 
 class Similarity(NamedTuple):
-    """B similarities: scale [B], > 0; rotation [B, 3, 3], orthogonal, determinant 1; shift [B, 3]."""
+    """B similarities."""
 
-    scale: Tensor
-    rotation: Tensor
-    shift: Tensor
+    scale: Tensor  # [B], > 0
+    rotation: Tensor  # [B, 3, 3], orthogonal, determinant 1
+    shift: Tensor  # [B, 3]
 
     def moved(self, points: Tensor) -> Tensor:
         """Images [B, N, 3] of points [B, N, 3]."""
@@ -25,10 +25,7 @@ class Similarity(NamedTuple):
 
 
 def small_similarity(numbers: Tensor) -> Similarity:
-    """The similarities that numbers [B, 7] describe; zeros are the identity. Differentiable everywhere.
-
-    Source: Rodrigues' formula.
-    """
+    """The similarities that numbers [B, 7] describe by Rodrigues' formula; zeros are the identity."""
     log_scale, turn, shift = numbers.split([1, 3, 3], dim=-1)
     x, y, z = turn.unbind(-1)
     none = torch.zeros_like(x)
