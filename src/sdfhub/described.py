@@ -27,7 +27,7 @@ RESERVED = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
 
 
 class Described:
-    """An object that remembers the arguments of its constructor, so that `describe` can write them down."""
+    """An object whose constructor's arguments are checked by their annotations, and kept for `describe`."""
 
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
@@ -40,9 +40,9 @@ def _remembering(initialise: Callable) -> Callable:
 
     @functools.wraps(initialise)
     def remember(self, *arguments: Any, **named: Any) -> None:
-        if "_arguments" not in self.__dict__:  # else the constructor of a class below this one came first
-            bound = signature.bind(self, *arguments, **named).arguments
-            self.__dict__["_arguments"] = dict(list(bound.items())[1:])
+        given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
+        check_arguments(initialise, given, type(self).__name__)
+        self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
         initialise(self, *arguments, **named)
 
     return remember

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
@@ -68,23 +69,18 @@ class Decoder(Described, nn.Module):
         self,
         encoding: nn.Module,
         activation: Callable[..., nn.Module],
-        code_size: int,
-        depth: int,
-        width: int,
+        code_size: PositiveInt,
+        depth: PositiveInt,
+        width: PositiveInt,
         inject_encoding: Sequence[int] = (),
         inject_code: Sequence[int] = (),
         shorten: bool = True,
         weight_norm: bool = True,
-        dropout: float = 0.0,
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0,
         tanh: bool = False,
         conditioning: type[Layer] | partial[Layer] = Concat,
     ):
         super().__init__()
-        if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
-            raise ValueError(
-                "depth, width and code_size must be at least 1, dropout in [0, 1); "
-                f"got {depth}, {width}, {code_size}, {dropout}"
-            )
         if not set(inject_encoding) | set(inject_code) <= set(range(1, depth + 1)):
             raise ValueError(f"inject_encoding and inject_code name layers 1 to {depth}")
         self.encoding, self.code_size = as_encoding(encoding), code_size
