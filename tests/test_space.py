@@ -329,7 +329,7 @@ STRANGERS = {
     "no decoder": (lambda a, t: a["model"].pop("decoder"), "not a shape space"),
     "an activation that is no recipe": (
         lambda a, t: a["model"]["decoder"].update(activation="sine"),
-        "describes no model|decoder.activation",
+        "decoder.activation",
     ),
     "a model that is a list": (lambda a, t: a.update(model=[]), "not a shape space"),
     "another width": (lambda a, t: a["model"]["decoder"].update(width=31), "another model"),

@@ -25,12 +25,7 @@ def activated(
 ) -> tuple[Tensor, Tensor | None]:
     """a(product + shift) and, where `sloped`, a'(product + shift), [B, N, W] with the dtype of `product`.
 
-    Args:
-        activation: a.
-        product: [B, N, W].
-        shift: [W] or [B, 1, W] float32.
-        dropout: probability in [0, 1) that a unit and its slope are 0; others are divided by 1 - dropout.
-        sloped: whether the slope is wanted; else it is None.
+    The shift is float32, [W] or [B, 1, W]; a unit that drops out has no slope either.
     """
     if not dropout and waves.fits(activation, product, shift):
         return waves.wave(activation, product, shift, sloped)
