@@ -135,12 +135,12 @@ class Bent(Gated):
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (partial(WrongSlope, 0.5), "WrongSlope: with_slope gives a wrong slope"),
-        (partial(ConstantSlope, 0.5), "ConstantSlope: the slope has a wrong derivative"),
+        (partial(WrongSlope, 0.5), "WrongSlope: with_slope gives a wrong derivative"),
+        (partial(ConstantSlope, 0.5), "ConstantSlope: with_slope has a wrong derivative"),
         (Normalised, "Normalised: is not elementwise"),
         (Root, "Root: value or slope at 0 is not finite"),
-        (partial(OtherFeatures, 2), "OtherFeatures: the pullback is wrong"),
-        (Unread, "Unread: the pullback is wrong"),
+        (partial(OtherFeatures, 2), "OtherFeatures: with_pullback gives a wrong derivative"),
+        (Unread, "Unread: pullback gives a wrong derivative"),
         (Bent, "Bent: the product is not linear in its inputs"),
     ],
 )

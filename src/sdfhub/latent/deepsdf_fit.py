@@ -1,7 +1,6 @@
 """DeepSDF's published recipe for the codes of unseen shapes: one start, Adam, signed samples alone."""
 
 import math
-from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -13,8 +12,6 @@ from torch import Tensor
 from sdfhub.errors import SdfhubError
 from sdfhub.latent.fitting import Fitted, frozen
 from sdfhub.latent.problem import Rows, violation
-from sdfhub.latent.similarity import PoseRange
-from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 from sdfhub.shapes import Observation
 
@@ -49,14 +46,7 @@ class DeepSdfFit:
     seed: NonNegativeInt = 0
 
     @torch.enable_grad()
-    def __call__(
-        self,
-        decoder: Decoder,
-        codes: Tensor,
-        observations: Sequence[Observation],
-        delta: float,
-        poses: PoseRange | None = None,
-    ) -> Fitted:
+    def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:
         """As `Fit` says; refuses an unknown frame, and a side with no bounds tight enough to be samples."""
         if poses:
             raise SdfhubError("fit=deepsdf: finds no poses; use fit=gauss_newton")

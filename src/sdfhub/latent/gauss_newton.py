@@ -12,8 +12,7 @@ from torch import Tensor
 from sdfhub.latent.fitting import Fitted, frozen
 from sdfhub.latent.gaussian import Gaussian
 from sdfhub.latent.problem import Problem, Rows, violation
-from sdfhub.latent.similarity import PoseRange, Similarity, small_similarity
-from sdfhub.model.decoder import Decoder
+from sdfhub.latent.similarity import Similarity, small_similarity
 from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.shapes import Observation
 
@@ -76,14 +75,7 @@ class GaussNewtonFit:
     seed: NonNegativeInt = 0
 
     @torch.no_grad()
-    def __call__(
-        self,
-        decoder: Decoder,
-        codes: Tensor,
-        observations: Sequence[Observation],
-        delta: float,
-        poses: PoseRange | None = None,
-    ) -> Fitted:
+    def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:
         """As `Fit` says."""
         likely = Gaussian.of(codes, self.shrinkage)
         priors = [(Gaussian.isotropic(codes[0]), self.lambda_code)]

@@ -139,7 +139,7 @@ class Problem:
         for copy, single in zip(copies, singles, strict=True):
             with torch.enable_grad():
                 copy = copy.detach().requires_grad_()
-                out = self.violation(Rows(*single, *rows[4:]), copy)[:, 0]
+                out = self.violation(Rows(*(*single, *rows[4:])), copy)[:, 0]
                 pairs.append((out.detach(), *torch.autograd.grad(out.sum(), copy)))
         out, jacobian = (torch.cat(column) for column in zip(*pairs, strict=True))
         return out.reshape(shapes, count), jacobian.unflatten(0, (shapes, count))

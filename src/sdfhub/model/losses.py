@@ -38,13 +38,10 @@ def normal_term(gradients: Tensor, normals: Tensor) -> Tensor:
 
 
 class Loss(Described):
-    """What a training lowers.
-
-    Attributes:
-        delta: half-width of the band in which distances count, > 0, also in fits of unseen shapes.
-    """
+    """What a training lowers."""
 
     delta: float = 0.1
+    """Half-width of the band in which distances count, > 0, also in fits of unseen shapes."""
 
     def wants_gradients(self, progress: float) -> bool:
         """Whether spatial gradients are given at this share of training, in [0, 1]; they cost time."""
@@ -104,15 +101,7 @@ class SdfLoss(Loss):
     def wants_gradients(self, progress: float) -> bool:
         return self.tau > 0 and progress >= self.tau_start
 
-    def parts(
-        self,
-        predicted: Tensor,
-        target: Tensor,
-        codes: Tensor,
-        gradients: Tensor | None,
-        normals: Tensor | None,
-        progress: float,
-    ) -> dict[str, Tensor]:
+    def parts(self, predicted, target, codes, gradients, normals, progress) -> dict[str, Tensor]:
         """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
         parts = {"sdf": clamped_l1(predicted, target, self.delta)}

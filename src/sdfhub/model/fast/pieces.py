@@ -82,7 +82,8 @@ class _Summed(torch.autograd.Function):
 
 def _differentiated(share: Share, learned: Sequence[Tensor]) -> tuple[Parts, list[Tensor]]:
     """Sums of the parts of the loss over pieces, and its gradient, one piece after the other."""
-    totals, gradients = {}, [torch.zeros_like(parameter) for parameter in learned]
+    totals: Parts = {}
+    gradients = [torch.zeros_like(parameter) for parameter in learned]
     for parts_of_piece in share:
         with torch.enable_grad():
             parts = parts_of_piece()
