@@ -1,8 +1,8 @@
 """Objects as plain data and back: what a checkpoint, an export and a config say of a model.
 
 A description is a mapping with `_target_`, the dotted path of a class, and the arguments of its constructor,
-as in a Hydra config; `_partial_` marks a factory. For one that comes from a file only classes of sdfhub and of
-packages that the caller trusts are imported.
+as in a Hydra config; `_partial_` marks a factory. For one that comes from a file only classes of sdfhub and
+of packages that the caller trusts are imported.
 """
 
 import contextlib

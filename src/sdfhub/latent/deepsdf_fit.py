@@ -24,26 +24,16 @@ class DeepSdfFit:
 
     Source: DeepSDF's published code: 800 steps, the learning rate divided by 10 halfway, z from
     N(0, 0.01^2), prior 1e-4 * mean z^2, 8000 samples a step.
-
-    Args:
-        steps: Adam steps.
-        lr: initial learning rate.
-        drop_at: share of the steps after which the learning rate is divided by 10.
-        per_step: samples a step and shape.
-        spread: standard deviation of the initial codes.
-        lambda_code: weight of the prior.
-        samples: signed samples that an observation of a stored shape should hold; None for all.
-        seed: of the initial code and the draws.
     """
 
     steps: PositiveInt = 800
     lr: PositiveFloat = 5e-3
-    drop_at: float = 0.5
-    per_step: Annotated[int, Field(ge=2)] = 8000
-    spread: NonNegativeFloat = 0.01
-    lambda_code: NonNegativeFloat = 1e-4
-    samples: PositiveInt | None = None
-    seed: NonNegativeInt = 0
+    drop_at: float = 0.5  # share of the steps after which the learning rate is divided by 10
+    per_step: Annotated[int, Field(ge=2)] = 8000  # samples a step and shape
+    spread: NonNegativeFloat = 0.01  # standard deviation of the initial codes
+    lambda_code: NonNegativeFloat = 1e-4  # weight of the prior
+    samples: PositiveInt | None = None  # that an observation of a stored shape should hold; None for all
+    seed: NonNegativeInt = 0  # of the initial code and the draws
 
     @torch.enable_grad()
     def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:

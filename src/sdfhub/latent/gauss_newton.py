@@ -38,41 +38,24 @@ class GaussNewtonFit:
     the observation. With an unknown pose: as many turns of it, each with the training code nearest then, the
     best ones. Signed samples have DeepSDF's prior, N(0, 1) in every direction; what scans leave open, the
     distribution of the training codes decides.
-
-    Args:
-        samples: signed samples that an observation of a stored shape should hold.
-        lambda_code: weight of DeepSDF's prior, mean z^2, for signed samples.
-        weight: of the distribution of the training codes, for scans.
-        weight_partial: the same for scans of only a part of the surface.
-        shrinkage: share of the isotropic covariance in that distribution: with less, few codes leave a
-            covariance that float32 cannot invert.
-        random: draws from that distribution to start from.
-        nearest: training codes to start from, by their violation on `probes` rows.
-        probes: rows that training codes, and turns of an unknown pose, are compared on.
-        thinning: starts see every so many-th row, the best of them then every root of it, then all.
-        steps: most steps of a descent.
-        tolerance: a descent ends when a step lowers its objective by a smaller share.
-        smallest: violation below which it counts squared, normalised frame; noise raises it.
-        blurred: the same while starts descend: a larger one leaves fewer minima to be caught in.
-        damping: of the first step, in units of the Hessian's mean diagonal.
-        seed: of the random draws.
     """
 
-    samples: PositiveInt = 16384
-    lambda_code: NonNegativeFloat = 1e-4
-    weight: NonNegativeFloat = 1e-4
-    weight_partial: NonNegativeFloat = 1e-3
+    samples: PositiveInt = 16384  # signed samples that an observation of a stored shape should hold
+    lambda_code: NonNegativeFloat = 1e-4  # weight of DeepSDF's prior, mean z^2, for signed samples
+    weight: NonNegativeFloat = 1e-4  # of the distribution of the training codes, for scans
+    weight_partial: NonNegativeFloat = 1e-3  # the same for scans of only a part of the surface
     shrinkage: Annotated[float, Field(ge=1e-4, le=1)] = 0.1
-    random: NonNegativeInt = 2
-    nearest: NonNegativeInt = 3
-    probes: PositiveInt = 256
-    thinning: PositiveInt = 16
-    steps: PositiveInt = 40
-    tolerance: float = 3e-3
-    smallest: PositiveFloat = 1e-3
-    blurred: PositiveFloat = 1e-2
-    damping: PositiveFloat = 10.0
-    seed: NonNegativeInt = 0
+    """Share of the isotropic covariance in that distribution; with less, few codes leave a singular one."""
+    random: NonNegativeInt = 2  # draws from that distribution to start from
+    nearest: NonNegativeInt = 3  # training codes to start from, by their violation on `probes` rows
+    probes: PositiveInt = 256  # rows that training codes, and turns of an unknown pose, are compared on
+    thinning: PositiveInt = 16  # starts see every so many-th row, the best every root of it, then all
+    steps: PositiveInt = 40  # at most, of a descent
+    tolerance: float = 3e-3  # a descent ends when a step lowers its objective by a smaller share
+    smallest: PositiveFloat = 1e-3  # violation below which it counts squared; noise raises it
+    blurred: PositiveFloat = 1e-2  # the same while starts descend: a larger one leaves fewer minima
+    damping: PositiveFloat = 10.0  # of the first step, in units of the Hessian's mean diagonal
+    seed: NonNegativeInt = 0  # of the random draws
 
     @torch.no_grad()
     def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:

@@ -45,20 +45,12 @@ def turns(count: int, up: str) -> Tensor:
 
 @dataclass(frozen=True)
 class PoseRange:
-    """How far an observation's frame may be from the normalised one, and from where the search starts.
+    """How far an observation's frame may be from the normalised one, and from where the search starts."""
 
-    Args:
-        turns: starts about the upright axis, evenly all around it: any turn about it is found.
-        tilt: of the upright axis, degrees.
-        scale: largest factor by which sizes may be wrong, either way.
-        shift: of the centre along an axis, normalised frame.
-        up: the axis that points up.
-    """
-
-    turns: PositiveInt
-    tilt: PositiveFloat
-    scale: Annotated[float, Field(gt=1)]
-    shift: PositiveFloat
+    turns: PositiveInt  # starts about the upright axis, evenly all around it: any turn about it is found
+    tilt: PositiveFloat  # of the upright axis, degrees
+    scale: Annotated[float, Field(gt=1)]  # largest factor by which sizes may be wrong, either way
+    shift: PositiveFloat  # of the centre along an axis, normalised frame
     up: Literal["y", "z"] = "z"
 
     def spread(self) -> Tensor:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -67,12 +67,7 @@ class AutoDecoder(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(
-        cls,
-        checkpoint_path: Any,
-        map_location: Any = "cpu",
-        *_: Any,
-        trust: str | Sequence[str] = (),
-        **__: Any,
+        cls, checkpoint_path: Any, map_location: Any = "cpu", *_, trust=(), **__
     ) -> Self:
         """The model of a checkpoint with its weights. Runs no code of the file.
 
@@ -80,9 +75,6 @@ class AutoDecoder(L.LightningModule):
             checkpoint_path: that a training wrote, such as RUN/checkpoints/last.ckpt.
             map_location: device of the weights.
             trust: packages beside sdfhub whose classes the checkpoint may name.
-
-        Raises:
-            SdfhubError: a damaged file, a class of another package, or weights of another model.
         """
         path = Path(checkpoint_path)
         content = read_checkpoint(path, map_location)

@@ -81,22 +81,14 @@ class SdfLoss(Loss):
     """Clamped L1 + lambda_code * prior of the codes + tau * normal term.
 
     Sums over points in the paper are means here, so that weights do not depend on the batch.
-
-    Args:
-        delta: clamp of signed distances, normalised frame, > 0.
-        lambda_code: weight of the code prior, >= 0.
-        code_norm: `squared` for |z|^2 or `l2` for |z|.
-        warmup: share of training over which lambda_code grows linearly from 0.
-        tau: weight of the normal term, >= 0; 0 switches it off.
-        tau_start: share of training before which tau is 0: normals cost time before they pay.
     """
 
-    delta: PositiveFloat = 0.1
-    lambda_code: NonNegativeFloat = 1e-4
-    code_norm: Literal["squared", "l2"] = "squared"
-    warmup: Share = 0.05
-    tau: NonNegativeFloat = 0.01
-    tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    delta: PositiveFloat = 0.1  # clamp of signed distances, normalised frame
+    lambda_code: NonNegativeFloat = 1e-4  # weight of the code prior
+    code_norm: Literal["squared", "l2"] = "squared"  # |z|^2 or |z|
+    warmup: Share = 0.05  # share of training over which lambda_code grows linearly from 0
+    tau: NonNegativeFloat = 0.01  # weight of the normal term; 0 switches it off
+    tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0  # share of training before which tau is 0
 
     def wants_gradients(self, progress: float) -> bool:
         return self.tau > 0 and progress >= self.tau_start

@@ -30,23 +30,18 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in
 
 @dataclass(frozen=True)
 class Computing:
-    """Settings that suit a device; None takes what does.
-
-    Args:
-        points_at_once: samples that go through the decoder together, on a CPU in each thread, >= 1; bounds
-            memory.
-        compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
-            None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
-        tinycudann: whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order.
-            None: on a GPU, where it is installed and agrees, unless deterministic algorithms are asked for.
-        matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
-            (TF32) on a GPU, else `highest`.
-    """
+    """Settings that suit a device; None takes what does."""
 
     points_at_once: PositiveInt | None = None
+    """Samples that go through the decoder together, on a CPU in each thread; bounds memory."""
     compile: bool | None = None
+    """Whether `torch.compile` fuses the decoder's passes, which needs a C compiler. None: on a GPU, where
+    that and Triton are there; what then does not compile runs as it is."""
     tinycudann: bool | None = None
+    """Whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order. None: on a
+    GPU, where it is installed and agrees, unless deterministic algorithms are asked for."""
     matmul: Literal["highest", "high", "medium"] | None = None
+    """Precision of float32 products. None: `high` (TF32) on a GPU, else `highest`."""
 
     def threads(self, device: torch.device) -> int:
         """Threads that work on samples of their own: on a CPU all, but what is compiled has one caller."""
