@@ -19,15 +19,12 @@ def check_derivatives(make: Any, **settings: Any) -> None:
     """Checks an activation, an encoding or a conditioning against differences in float64.
 
     Values, first derivatives, the derivatives of those by points, codes and weights (which a loss of normals
-    needs), shapes, dtypes and finite numbers.
+    needs), shapes, dtypes and finite numbers. An `AssertionError` says what is wrong.
 
     Args:
         make: a class, a partial of one, or an instance: an `Activation` or elementwise module, an `Encoding`
             or module with `features`, or a class of `Layer`.
         settings: arguments of the class.
-
-    Raises:
-        AssertionError: says what is wrong.
     """
     make = partial(make, **settings) if settings else make
     torch.manual_seed(0)

@@ -13,11 +13,7 @@ class CodeTable(Described, nn.Module):
     """Learned codes, started at N(0, 1 / L), so that their expected norm is 1.
 
     Source: Park et al. 2019, section 4.2; `max_norm` as in its published code.
-
-    Args:
-        shapes: S, number of rows.
-        size: L, numbers in a code.
-        max_norm: longer codes are shortened to it when they are read; None for no limit.
+    Codes [shapes, size] longer than `max_norm` are shortened to it when they are read.
     """
 
     def __init__(self, shapes: PositiveInt, size: PositiveInt, max_norm: PositiveFloat | None = None):

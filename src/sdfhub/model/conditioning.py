@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from sdfhub.described import Described
 from sdfhub.model.derivatives import value_and_pullback
 
+# of hidden [B, N, H] and of encoding [B, N, F]; None for a part that a layer does not read
 Cotangents = tuple[Tensor | None, Tensor | None]
-"""Of hidden [B, N, H] and of encoding [B, N, F]; None for a part that a layer does not read."""
 
 
 def full_precision(like: Tensor) -> AbstractContextManager:

@@ -16,8 +16,7 @@ from sdfhub.model.dropout import dropout_factors
 from sdfhub.model.encodings import as_encoding
 from sdfhub.model.fast import waves
 
-HEAD_SPREAD = 0.03
-"""Standard deviation of the initial output for hidden units of size 1: well inside the clamp delta = 0.1."""
+HEAD_SPREAD = 0.03  # of the initial output for hidden units of size 1: well inside the clamp delta = 0.1
 
 
 def activated(
@@ -89,10 +88,8 @@ class Decoder(Described, nn.Module):
             after += code_size * (index + 1 in inject_code) * kind.joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
-                raise ValueError(
-                    f"width {width} leaves no room for {after} re-injected features; "
-                    "widen it, encode with fewer features, or set shorten=false"
-                )
+                hint = "widen it, encode with fewer features, or set shorten=false"
+                raise ValueError(f"width {width} leaves no room for {after} re-injected features; {hint}")
             encoded = features if index == 0 or index in inject_encoding else 0
             code = code_size if index == 0 or index in inject_code else 0
             layers.append(conditioning(hidden, encoded, code, outputs))
@@ -122,9 +119,7 @@ class Decoder(Described, nn.Module):
             encoded = self.encoding(points)
         return self._field(encoded, codes)[0]
 
-    def _field(
-        self, encoded: Tensor, codes: Tensor, sloped: bool = False
-    ) -> tuple[Tensor, list[Tensor | None]]:
+    def _field(self, encoded: Tensor, codes: Tensor, sloped=False) -> tuple[Tensor, list[Tensor | None]]:
         """Signed distances [B, N] and each hidden layer's slopes [B, N, W], where wanted, else None."""
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
@@ -143,10 +138,6 @@ class Decoder(Described, nn.Module):
 
         The chain rule is written out as one more pass through the layers, so that a loss of the gradient
         is differentiated once, like any other, and the whole compiles.
-
-        Args:
-            points: normalised frame.
-            codes: [B, L].
         """
         with full_precision(points):
             encoded, to_space = self.encoding.with_pullback(points)

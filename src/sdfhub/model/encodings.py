@@ -16,18 +16,13 @@ from torch import Tensor, nn
 from sdfhub.described import Described
 from sdfhub.model.derivatives import Pullback, value_and_pullback
 
-PRIMES = (1, 2_654_435_761, 805_459_861)
-"""Factors of the spatial hash. Source: Mueller et al. 2022, section 3."""
+PRIMES = (1, 2_654_435_761, 805_459_861)  # factors of the spatial hash: Mueller et al. 2022, section 3
 
 
 class Encoding(Described, nn.Module, ABC):
-    """A map from points to features.
+    """A map from points to features."""
 
-    Attributes:
-        features: F, the number of features of a point.
-    """
-
-    features: int
+    features: int  # F, the number of features of a point
 
     @abstractmethod
     def forward(self, points: Tensor) -> Tensor:

@@ -12,8 +12,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat
 from pydantic.dataclasses import dataclass
 from torch import nn
 
-Schedule = Callable[[float], float]
-"""A factor of every learning rate as a function of the share of training done, in [0, 1]."""
+Schedule = Callable[[float], float]  # from the share of training done to a factor of learning rates
 
 
 @dataclass(frozen=True)
@@ -56,11 +55,8 @@ class Optimisation:
 
     @classmethod
     def of(cls, make: Any) -> "Optimisation":
-        """An optimisation itself, or that of a partial of this class or of an optimiser.
-
-        An optimiser's, such as `partial(torch.optim.AdamW, lr_decoder=1e-3, weight_decay=0.01)`, may have
-        keywords of this class too; its `lr` stands for a rate that is not given.
-        """
+        """An optimisation itself, or that of a partial of this class or of an optimiser, which may have
+        keywords of this class too; its `lr` stands for a rate that is not given."""
         if hasattr(make, "configure"):
             return make
         if make.func is cls:

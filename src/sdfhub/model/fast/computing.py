@@ -19,12 +19,9 @@ from sdfhub.model.encodings import Encoding
 from sdfhub.model.fast.fused_hash import can_fuse, fused
 from sdfhub.model.fast.side_by_side import side_by_side
 
+# samples worked on together: what stays in a core's caches; what fills a GPU and not its memory
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
-"""Samples worked on together: what stays in a core's caches; what fills a GPU and not its memory."""
-
-LEAST = 2**10
-"""Samples that are worth a thread of their own."""
-
+LEAST = 2**10  # samples that are worth a thread of their own
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
 
 

@@ -13,10 +13,8 @@ from sdfhub.model.dropout import drawn_from
 from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.shapes import Batch
 
-Parts = dict[str, Tensor]
-"""Weighted terms of the loss by name; their sum is the loss."""
-Share = Sequence[Callable[[], Parts]]
-"""Pieces of one thread."""
+Parts = dict[str, Tensor]  # weighted terms of the loss by name; their sum is the loss
+Share = Sequence[Callable[[], Parts]]  # the pieces of one thread
 
 
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:

@@ -16,9 +16,8 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+# threads first call MKL's vector functions in turn: of two at once, one had sines good to a ten-thousandth
 _FIRST = Lock()
-"""Threads call MKL's vector functions for the first time in turn: of two that did so at once, one had sines
-good to a ten-thousandth, once in some hundred processes."""
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: int = 2) -> list[Result]:
