@@ -14,16 +14,8 @@ from sdfhub.report.results import ROLES
 from sdfhub.report.rows import Group
 from sdfhub.report.tables import TITLES
 
-STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "sdfhub",
-    "font.family": "sans-serif",
-    "font.size": 9,
-}
+STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "sdfhub", "font.size": 9}
 STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, "axes.spines.right": False}
-
-KEEP = {"scalars": 0, "images": 1, "audio": 1, "histograms": 1, "tensors": 1}
-"""Of each tag in an event file; 0 keeps all."""
 
 
 def charts(group: Group) -> list[tuple[str, str]]:
@@ -42,8 +34,7 @@ def loss_chart(group: Group) -> str | None:
     for index, row in enumerate(group.rows):
         curves = filter(None, (loss_curve(cell.folder) for cell in row.done))
         for number, curve in enumerate(curves):
-            label = None if number else _text(row.label)
-            line = "-" if row.normals == "on" else "--"
+            label, line = None if number else _text(row.label), "-" if row.normals == "on" else "--"
             axes.plot(*zip(*curve, strict=True), color=f"C{index % 10}", ls=line, lw=1.3, label=label)
     if not axes.lines:
         return None
@@ -82,11 +73,12 @@ def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tupl
     if not folder.resolve().is_relative_to(run.resolve()):
         return []
     try:
-        scalars = EventAccumulator(str(folder), size_guidance=KEEP).Reload().Scalars(tag)
+        keep = {"scalars": 0, "images": 1, "tensors": 1}  # of each tag; 0 is all
+        scalars = EventAccumulator(str(folder), size_guidance=keep).Reload().Scalars(tag)
     except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
         return []
     curve = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
-    return curve[::-1][:: max(1, -(-len(curve) // points))][::-1]
+    return curve[:: max(1, -(-len(curve) // points))]
 
 
 def _text(text: str) -> str:

@@ -2,10 +2,7 @@
 
 import base64
 import io
-import os
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +12,10 @@ import trimesh
 from PIL import Image
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.render import render
 from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
-from sdfhub.report.rows import Group
+from sdfhub.report.rows import Group, Row
 from sdfhub.shapes import Frame
 
 PIXELS, PAPER = 208, 0.955
@@ -27,7 +23,6 @@ PIXELS, PAPER = 208, 0.955
 
 FEWEST, MOST = 400, 4000  # triangles of a mesh to turn
 TO_TURN = 4  # shapes to turn for each group, at most
-A_WORKERS_WORTH = 32  # meshes for which it pays to start a process that draws them
 FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
@@ -38,6 +33,76 @@ class ShownMesh(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
     up: UpAxis
+
+
+class Tile(NamedTuple):
+    """A picture [S, S, 3] uint8, the text below it or in its place, and its `packed` mesh, to be turned."""
+
+    text: str
+    image: np.ndarray | None = None
+    turning: dict[str, Any] | None = None
+
+
+class Sheet(NamedTuple):
+    """Tiles in rows with labels, under the shapes that they show: role and id."""
+
+    shapes: list[tuple[str, str]]
+    rows: list[tuple[str, list[Tile]]]
+
+    @property
+    def columns(self) -> list[str]:
+        """Captions of the shapes."""
+        return [f"{id} ({role.replace('_', ' ')})" for role, id in self.shapes]
+
+    @property
+    def turning(self) -> list[dict[str, Any]]:
+        """The meshes to turn: a dict a shape with its `name`, its `role` and its meshes, labelled."""
+        shapes = []
+        for column, (role, id) in enumerate(self.shapes):
+            meshes = [(label, tiles[column].turning) for label, tiles in self.rows]
+            panels = [{"label": label} | mesh for label, mesh in meshes if mesh]
+            shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
+        return shapes
+
+
+def contact_sheet_of(group: Group, count: int, room: int, find_truth: FindTruth) -> Sheet:
+    """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6.
+
+    Args:
+        group: its rows are shown by their first finished cells.
+        count: shapes to show.
+        room: bytes that the meshes to turn may take on the page.
+        find_truth: finds the true shapes.
+    """
+    shapes, to_turn = chosen(group, count), chosen(group, min(count, TO_TURN))
+    triangles = room // max(1, len(to_turn) * (len(group.rows) + 1) * 12)  # some 12 bytes each, as base64
+    triangles = min(MOST, max(FEWEST, triangles))
+
+    def tile(shape: tuple[str, str], text: str, mesh: ShownMesh | None) -> Tile:
+        if mesh is None:
+            return Tile(text)
+        image = render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
+        return Tile(text, image, packed(mesh, triangles) if shape in to_turn else None)
+
+    rows = [
+        (row.label, [tile(shape, *_shown(row, *shape, find_truth)) for shape in shapes]) for row in group.rows
+    ]
+    truths = [true_mesh(find_truth(group.first, id)) for _, id in shapes] if group.first else []
+    if any(truths):
+        tiles = [tile(s, "" if mesh else "no truth", mesh) for s, mesh in zip(shapes, truths, strict=True)]
+        rows.insert(0, ("Ground truth", tiles))
+    return Sheet(shapes, rows)
+
+
+def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> tuple[str, ShownMesh | None]:
+    """What a row has of a shape: a text, and the mesh that it stands below."""
+    if row.first is None:
+        return row.state, None
+    score = _scores(row.first, role).get(id)
+    if score is None or score.failed:
+        return "no surface" if score else "not judged", None
+    mesh = reconstruction(row.first.folder, role, score, find_truth(row.first, id))
+    return f"CD {score.counted_cd * TABLE_UNIT:.3f}" if mesh else "no mesh", mesh
 
 
 def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
@@ -82,97 +147,16 @@ def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
     return {"vertices": len(vertices), "faces": len(faces), "data": data}
 
 
-@dataclass
-class Tile:
-    """A picture [S, S, 3] uint8 of what `read` reads, and the text below it or in its place."""
-
-    text: str
-    read: Callable[[], ShownMesh | None] | None = None
-    image: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """Pictures in rows with labels, under columns with captions."""
-
-    columns: list[str]
-    rows: list[tuple[str, list[Tile]]]
-
-
-def contact_sheets(groups: list[Group], count: int, find_truth: FindTruth) -> list[Sheet]:
-    """Truth, then each row of a group, for some shapes, a sheet a group: the paper's figures 2 to 6."""
-    sheets = [_sheet(group, count, find_truth) for group in groups]
-    tiles = [tile for sheet in sheets for _, row in sheet.rows for tile in row if tile.read]
-    readers = [tile.read for tile in tiles]
-    workers = min(os.cpu_count() or 1, len(readers) // A_WORKERS_WORTH)
-    images: Any = stream_in_processes(picture, readers, workers)
-    for tile, image in zip(tiles, images, strict=True):
-        tile.image, tile.text = image, "no mesh" if image is None else tile.text
-    return sheets
-
-
-def _sheet(group: Group, count: int, find_truth: FindTruth) -> Sheet:
-    shown, first = chosen(group, count), group.first
-    truths = [_truth_tile(find_truth(first, id)) for _, id in shown] if first else []
-    rows = [("Ground truth", truths)] if any(tile.read for tile in truths) else []
-    for row in group.rows:
-        absent = "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
-        cell = row.first
-        rows.append((row.label, [_tile(cell, *s, find_truth) if cell else Tile(absent) for s in shown]))
-    return Sheet([f"{id} ({role.replace('_', ' ')})" for role, id in shown], rows)
-
-
-def _truth_tile(truth: StoredShape | None) -> Tile:
-    return Tile("", partial(true_mesh, truth)) if truth and truth.rows("faces") else Tile("no truth")
-
-
-def _tile(cell: Cell, role: str, id: str, find_truth: FindTruth) -> Tile:
-    score = _scores(cell, role).get(id)
-    if score is None or score.failed:
-        return Tile("no surface" if score else "not judged")
-    read = partial(reconstruction, cell.folder, role, score, find_truth(cell, id))
-    return Tile(f"CD {score.counted_cd * TABLE_UNIT:.3f}", read)
-
-
-def picture(read_mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
-    """[S, S, 3] uint8 of a mesh from the usual side; None without one."""
-    mesh = read_mesh()
-    return render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER) if mesh else None
-
-
-def turning_meshes(group: Group, count: int, room: int, find_truth: FindTruth) -> list[dict]:
-    """Some shapes of a group, truth and rows, decimated to some `room` bytes for the viewer of the page.
-
-    Returns:
-        A dict a shape: `name`, `role` and `panels`, its meshes as `packed` with a `label` each.
-    """
-    shown, cells = (
-        chosen(group, min(count, TO_TURN)),
-        {row.label: row.first for row in group.rows if row.first},
-    )
-    triangles = room // max(1, len(shown) * (len(cells) + 1) * 12)  # some 12 bytes each, as base64
-    triangles = min(MOST, max(FEWEST, triangles))
-    shapes = []
-    for role, id in shown:
-        readers = {label: _tile(cell, role, id, find_truth).read for label, cell in cells.items()}
-        readers = {"Ground truth": _truth_tile(find_truth(next(iter(cells.values())), id)).read} | readers
-        meshes = {label: read() for label, read in readers.items() if read}
-        panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes.items() if mesh]
-        shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
-    return shapes
-
-
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     """Role and id of the shapes to show: the first training ones, and up to a third held out."""
     train, held_out = (list(_scores(group.first, role)) if group.first else [] for role in ROLES)
     held_out = held_out[: max(count // 3, count - len(train))]
-    train = train[: count - len(held_out)]
-    return [("train", id) for id in train] + [("held_out", id) for id in held_out]
+    return [("train", id) for id in train[: count - len(held_out)]] + [("held_out", id) for id in held_out]
 
 
 def _scores(cell: Cell, role: str) -> dict[str, ShapeScore]:
     """The scores of a role by id; {} where shapes have no surfaces to be judged by."""
-    return {s.id: s for s in cell.result.shapes.get(role, []) if isinstance(s, ShapeScore)}
+    return {s.id: s for s in cell.scores.shapes.get(role, []) if isinstance(s, ShapeScore)}
 
 
 def picture_uri(image: np.ndarray) -> str:

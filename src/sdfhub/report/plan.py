@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+from pydantic import BaseModel, StringConstraints, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
@@ -20,10 +20,8 @@ Text = Annotated[str, StringConstraints(max_length=2000)]
 FolderName = Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_length=255)]
 
 
-class PlannedCell(BaseModel):
+class PlannedCell(BaseModel, frozen=True, extra="forbid", strict=True):
     """One cell as its command line described it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     folder: FolderName  # below the sweep's
     choices: dict[Text, Text]  # option by config group, `sweeps` among them
@@ -36,10 +34,8 @@ class PlannedCell(BaseModel):
         return tuple(sorted(self.choices.items())), tuple(sorted(self.settings.items())), self.seed
 
 
-class Plan(BaseModel):
+class Plan(BaseModel, extra="forbid"):
     """The content of `sweep.json`: the cells in the order of their commands, and these."""
-
-    model_config = ConfigDict(extra="forbid")
 
     version: Literal[1] = 1
     cells: list[PlannedCell] = []
@@ -47,11 +43,7 @@ class Plan(BaseModel):
 
 
 def read_plan(sweep: Path) -> Plan:
-    """What a sweep's folder consists of.
-
-    Raises:
-        SdfhubError: it is not a sweep's folder, or `sweep.json` is broken.
-    """
+    """What a sweep's folder consists of; refuses one that is none, or whose `sweep.json` is broken."""
     try:
         return Plan.model_validate_json((sweep / PLAN).read_bytes())
     except OSError as error:

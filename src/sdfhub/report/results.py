@@ -4,7 +4,7 @@ Nothing in a cell's files is run, and no link is followed out of its folder.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,13 +25,13 @@ Name = Annotated[str, StringConstraints(max_length=300)]
 
 
 class ShapeScore(BaseModel, frozen=True):
-    """One judged shape: Chamfer distance, its noise floor, what a failure counts as, agreement of normals."""
+    """One judged shape."""
 
     id: Name
     cd: Number | None
     floor: Number
-    cd_penalty: Number
-    failed: bool
+    cd_penalty: Number  # the Chamfer distance of a single point
+    failed: bool  # the field has no surface
     normal_consistency: Number | None = None
 
     @property
@@ -53,9 +53,6 @@ class DistanceScore(BaseModel, frozen=True):
     sign_accuracy: Number
 
 
-RoleScores = list[ShapeScore] | list[DistanceScore]
-
-
 class Training(BaseModel, frozen=True):
     """The cost of a training, and versions and hardware by name."""
 
@@ -67,24 +64,22 @@ class Training(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a finished cell."""
+    """The scores of a finished cell; nothing is in those of another."""
 
-    shapes: dict[str, RoleScores]  # by role
-    training: Training
-    trained_on: int  # shapes, without augmented copies
-    config: dict[str, Any]  # of config.yaml
+    shapes: dict[str, list[ShapeScore] | list[DistanceScore]] = field(default_factory=dict)  # by role
+    training: Training = field(default_factory=lambda: Training(seconds=0, steps=0, parameters=0))
+    trained_on: int = 0  # shapes, without augmented copies
+    config: dict[str, Any] = field(default_factory=dict)  # of config.yaml
 
     def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
-        costs: dict[str, float] = self.training.model_dump(exclude={"made_with"})
-        costs["trained_on"] = self.trained_on
+        costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
         settings = flat(self.config)
         try:
-            costs["epochs"] = float(int(settings["trainer.max_epochs"]))
+            costs["epochs"] = int(settings["trainer.max_epochs"])
             rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
             shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
-            samples = shapes * int(settings["data.loader.samples_per_shape"])
-            costs["samples"] = float(samples * self.training.steps)
+            costs["samples"] = shapes * int(settings["data.loader.samples_per_shape"]) * self.training.steps
         except (KeyError, TypeError, ValueError, OverflowError):
             pass  # a loader of the user's own
         return costs
@@ -97,22 +92,12 @@ class Cell:
     plan: PlannedCell
     folder: Path
     state: Literal["done", "failed", "missing"]
-    reason: str = ""  # why there are no scores
-    scores: Scores | None = None  # of a cell that is done
-
-    @property
-    def result(self) -> Scores:
-        """The scores of a cell that is done."""
-        assert self.scores is not None
-        return self.scores
+    reason: str = ""  # why it is not done
+    scores: Scores = Scores()
 
 
 def read_sweep(sweep: Path) -> list[Cell]:
-    """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing.
-
-    Raises:
-        SdfhubError: not a sweep's folder.
-    """
+    """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing."""
     return [_read_cell(plan, sweep / plan.folder) for plan in read_plan(sweep).cells]
 
 
@@ -123,7 +108,7 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
         if is_locked(folder / ".lock"):
             return Cell(plan, folder, "missing", "is being trained")
         if (folder / FAILURE).exists():
-            return Cell(plan, folder, "failed", str(_loaded(folder, FAILURE).get("reason"))[:500])
+            return Cell(plan, folder, "failed", str(_read(folder, FAILURE).get("reason"))[:500])
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
             return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
@@ -133,33 +118,26 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
 
 
 def read_scores(folder: Path) -> Scores:
-    """The scores of a finished run's folder.
-
-    Raises:
-        SdfhubError: a file is missing, broken or not what training writes.
-    """
-    metrics, shapes = _loaded(folder, "metrics.json"), {}
+    """The scores of a finished run's folder; refuses files that are not what training writes."""
+    metrics, shapes = _read(folder, "metrics.json"), {}
     for role in filter(metrics.get, ROLES):
-        rows = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}").get("shapes")
+        rows = _checked(dict, metrics[role], f"metrics.json: {role}").get("shapes")
         kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
         shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
     training = _checked(Training, metrics.get("training"), "metrics.json: training")
-    trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
-    return Scores(shapes, training, len(trained_on), _loaded(folder, "config.yaml"))
+    trained_on = _checked(list[Name], _read(folder, "split.json").get("train"), "split.json: train")
+    return Scores(shapes, training, len(trained_on), _read(folder, "config.yaml"))
 
 
-def _loaded(folder: Path, name: str) -> dict[str, Any]:
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+def _read(folder: Path, name: str) -> dict[str, Any]:
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise SdfhubError(f"{name}: is a link out of its folder")
     try:
-        text = path.read_text(encoding="utf-8")
-        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        text = (folder / name).read_text(encoding="utf-8")
+        content = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise SdfhubError(f"{name}: cannot be read ({type(error).__name__})") from error
-    if not isinstance(content, dict):
-        raise SdfhubError(f"{name}: not what training writes")
-    return content
+    return _checked(dict, content, name)
 
 
 def _checked(kind: Any, content: Any, name: str) -> Any:

@@ -45,7 +45,7 @@ class Row:
     @property
     def done(self) -> list[Cell]:
         """The finished cells."""
-        return [cell for cell in self.cells if cell.scores]
+        return [cell for cell in self.cells if cell.state == "done"]
 
     @property
     def first(self) -> Cell | None:
@@ -53,9 +53,14 @@ class Row:
         return next(iter(self.done), None)
 
     @property
+    def state(self) -> str:
+        """What stands for the row where no cell is finished: `failed` or `missing`."""
+        return "failed" if any(cell.state == "failed" for cell in self.cells) else "missing"
+
+    @property
     def searched(self) -> str:
         """What search the settings come from, as the experiment's config says."""
-        return str(self.first.result.config.get("searched") or "no")[:200] if self.first else NONE
+        return str(self.first.scores.config.get("searched") or "no")[:200] if self.first else NONE
 
 
 @dataclass(frozen=True)
@@ -71,16 +76,16 @@ class Group:
         return next((row.first for row in self.rows if row.first), None)
 
     @property
-    def title(self) -> str:
-        """`chairs, data=open, scale=cpu, fit=gauss_newton, evaluate=paper, trained on 20`."""
-        return ", ".join(self.title_parts)
+    def settings(self) -> list[str]:
+        """What of `judging` the command line set, as `key=value`."""
+        return [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
 
     @property
-    def title_parts(self) -> list[str]:
-        """The words of the title, the category first."""
+    def title(self) -> list[str]:
+        """Words such as `chairs`, `data=open`, `scale=cpu`, `evaluate=paper`, `trained on 20`."""
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
-        counts = {cell.result.trained_on for row in self.rows for cell in row.done}
-        ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
+        counts = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
+        ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
         return [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
 
     @cached_property
@@ -91,7 +96,7 @@ class Group:
             | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
-            for role, shapes in cell.result.shapes.items()
+            for role, shapes in cell.scores.shapes.items()
             for shape in shapes
         ]  # fmt: skip
         frame = pd.DataFrame(records, columns=[*PLACES, *SCORED]).astype(dict.fromkeys(SCORED, float))
@@ -113,7 +118,7 @@ class Group:
     @cached_property
     def costs(self) -> pd.DataFrame:
         """COSTS by label, over seeds as in `statistics`."""
-        records = [{"label": row.label} | cell.result.costs() for row in self.rows for cell in row.done]
+        records = [{"label": row.label} | cell.scores.costs() for row in self.rows for cell in row.done]
         frame = pd.DataFrame(records, columns=["label", *COSTS]).astype(dict.fromkeys(COSTS, float))
         return over_seeds(frame, ["label"])
 
@@ -128,7 +133,7 @@ def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 def settings_of(cell: Cell) -> dict[str, str]:
     """Settings of a finished cell by dotted key that can change its result, but for the seed's."""
-    settings = deciding(cell.result.config).items()
+    settings = deciding(cell.scores.config).items()
     return {str(k): str(v)[:200] for k, v in settings if k not in (*OF_THE_SEED, "searched")}
 
 
@@ -168,7 +173,7 @@ def _rows(cells: list[Cell]) -> list[Row]:
         own = dict(pair for pair in plan.settings.items() if pair not in shared)
         own |= {key: plan.choices.get(key, NONE) for key in differing(namesakes)}
         parts = _by_settings(members)
-        changed = differing([settings_of(part[0]) for part in parts]) if len(parts) > 1 else {}
+        changed = differing([settings_of(part[0]) for part in parts])
         for number, part in enumerate(parts):
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
             detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
@@ -181,13 +186,11 @@ def _rows(cells: list[Cell]) -> list[Row]:
 
 def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
     """Seeds of one command line, apart where defaults changed between them; unfinished ones with the last."""
-    parts: dict[tuple, list[Cell]] = {}
-    for cell in cells:
-        if cell.scores:
-            parts.setdefault(tuple(settings_of(cell).items()), []).append(cell)
-    lists = list(parts.values()) or [[]]
-    lists[-1].extend(cell for cell in cells if not cell.scores)
-    return lists
+    parts: dict[str, list[Cell]] = {}
+    for cell in sorted(cells, key=lambda cell: cell.state != "done"):
+        key = str(settings_of(cell)) if cell.state == "done" else next(reversed(parts), "")
+        parts.setdefault(key, []).append(cell)
+    return list(parts.values())
 
 
 def _name(choices: dict[str, str]) -> tuple[str, str]:
@@ -231,5 +234,6 @@ def shapes_csv(groups: list[Group]) -> str:
 
 def _place(group: Group) -> dict[str, str]:
     """What tells a group from others, by column of a CSV file."""
-    settings = [f"{key}={value}" for key, value in group.judging.items() if key not in JUDGING_GROUPS]
-    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {"settings": ";".join(settings)}
+    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {
+        "settings": ";".join(group.settings)
+    }

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import logging
 import re
+from collections import Counter
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.opening import data_of
 from sdfhub.report.charts import charts
-from sdfhub.report.pictures import FindTruth, Sheet, contact_sheets, picture_uri, turning_meshes
+from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, picture_uri
 from sdfhub.report.plan import read_plan
 from sdfhub.report.results import Cell, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
@@ -35,19 +36,22 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     """Writes tables (md, tex, csv), `shapes.csv`, a sheet a group and `report.html`; prints the tables.
 
     Returns the cells of the sweep, finished or not, of which `shapes` shapes are pictured side by side.
-
-    Raises:
-        SdfhubError: not a sweep's folder.
     """
     cells = read_sweep(sweep)
     groups, find_truth = group_cells(cells), truth_finder()
     before, after = overview(groups), [origin(read_plan(sweep).commands, cells)]
-    sheets = contact_sheets(groups, shapes, find_truth)
-    parts: list[dict[str, Any]] = [
-        {"title": group.title, "tables": tables(group), "charts": charts(group), "sheet": sheet}
-        | {"turning": turning_meshes(group, shapes, MESH_BYTES // len(groups), find_truth)}
-        for group, sheet in zip(groups, sheets, strict=True)
-    ]
+    parts: list[dict[str, Any]] = []
+    for group in groups:
+        sheet = contact_sheet_of(group, shapes, MESH_BYTES // len(groups), find_truth)
+        write_sheet(sheet, out / f"{sheet_name(group)}.png")
+        parts.append(
+            {
+                "title": ", ".join(group.title),
+                "tables": tables(group),
+                "charts": charts(group),
+                "sheet": sheet,
+            }
+        )
     sections: list[tuple[str, list[Table]]] = [("All tables", before)] if before else []
     sections += [*((part["title"], part["tables"]) for part in parts), ("Origin", after)]
     text = "\n".join(markdown(title, part) for title, part in sections)
@@ -56,11 +60,9 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
     write_whole(out / "table.tex", latex(sections))
     write_whole(out / "table.csv", table_csv(groups))
     write_whole(out / "shapes.csv", shapes_csv(groups))
-    for group, sheet in zip(groups, sheets, strict=True):
-        write_sheet(sheet, out / f"{sheet_name(group)}.png")
-    states = [cell.state for cell in cells]
-    counts = [f"{states.count(state)} {state}" for state in ("failed", "missing") if state in states]
-    counts = [f"{states.count('done')} of {len(cells)} cells done", *counts]
+    states = Counter(cell.state for cell in cells)
+    counts = [f"{states[state]} {state}" for state in ("failed", "missing") if states[state]]
+    counts = [f"{states['done']} of {len(cells)} cells done", *counts]
     content = {"overview": before, "parts": parts, "origin": after}
     write_whole(out / "report.html", page(name=sweep.name, counts=", ".join(counts), **content))
     print(f"report: {out / 'report.html'}", flush=True)
@@ -83,15 +85,18 @@ def page(**content: Any) -> str:
 def sheet_name(group: Group) -> str:
     """A name of its own for each group of a sweep."""
     choices = [group.judging[name] for name in JUDGING_GROUPS if name in group.judging]
-    settings = ";".join(f"{k}={v}" for k, v in sorted(group.judging.items()) if k not in JUDGING_GROUPS)
-    digest = [hashlib.sha256(settings.encode()).hexdigest()[:8]] if settings else []
-    return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *choices, *digest]))
+    digest = hashlib.sha256(";".join(sorted(group.settings)).encode()).hexdigest()[:8]
+    return re.sub(
+        r"[^A-Za-z0-9._-]", "-", "_".join(["sheet", *choices, *([digest] if group.settings else [])])
+    )
 
 
 def write_sheet(sheet: Sheet, path: Path) -> None:
     """A contact sheet as a picture of its own; none where nothing was judged."""
-    rows = [[tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows]
-    if sheet.columns:
+    if sheet.shapes:
+        rows = [
+            [tile.text if tile.image is None else tile.image for tile in tiles] for _, tiles in sheet.rows
+        ]
         captions = [column.replace(" (", "\n(") for column in sheet.columns]
         contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
 
@@ -101,7 +106,7 @@ def truth_finder() -> FindTruth:
     stores: dict[str, Store | None] = {}
 
     def find(cell: Cell, id: str) -> StoredShape | None:
-        config = cell.result.config
+        config = cell.scores.config
         key = str(config.get("data"))
         if key not in stores:
             stores[key] = _store(config)
