@@ -74,7 +74,7 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = map("{}, {}{}".format, means, medians, seeds)
+            texts = ["{}, {}{}".format(*parts) for parts in zip(means, medians, seeds, strict=True)]
             texts = [NONE if text == f"{NONE}, {NONE}" else text for text in texts]
             frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
         if (frame.iloc[:, 1:] != NONE).any(axis=None):
