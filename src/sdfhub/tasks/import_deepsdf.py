@@ -141,6 +141,7 @@ def decoder_weights(
     weights = {}
     try:
         for index in range(node["depth"] + 1):
+            weights[f"layers.{index}.linear.bias"] = left.pop(f"lin{index}.bias")
             length = left.pop(f"lin{index}.weight_g", None)
             if length is None:
                 weight = left.pop(f"lin{index}.weight")
@@ -153,7 +154,6 @@ def decoder_weights(
                 hidden = weight.shape[1] - 3 - node["code_size"]
                 weight = torch.cat([weight[:, :hidden], weight[:, -3:], weight[:, hidden:-3]], dim=1)
             weights[f"layers.{index}.linear.weight"] = weight
-            weights[f"layers.{index}.linear.bias"] = left.pop(f"lin{index}.bias")
     except KeyError as error:
         raise SdfhubError(f"{path}: lacks {error}, which specs.json describes") from error
     if left:
