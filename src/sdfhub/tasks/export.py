@@ -76,11 +76,7 @@ def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
 
 
 def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
-    """A function as the content of a file.
-
-    Raises:
-        SdfhubError: what this needs is not installed.
-    """
+    """A function as the content of a file."""
     content = io.BytesIO()
     with _quiet():
         if kind == "torch_export":
@@ -90,22 +86,12 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
             import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-        program = torch.onnx.export(
-            function, input_names=["points", "codes"], output_names=["sdf"], dynamo=True, verbose=False
-        )
+        names: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+        program = torch.onnx.export(function, dynamo=True, verbose=False, **names)
         assert program
-        return _with_named_axes(program.model_proto).SerializeToString()
-
-
-def _with_named_axes(model: Any) -> Any:
-    """An ONNX model whose free axes are called B and N, where PyTorch's exporter numbers them."""
-    graph = model.graph
-    batch, points = (axis.dim_param for axis in graph.input[0].type.tensor_type.shape.dim[:2])
-    for value in (*graph.input, *graph.output, *graph.value_info):
-        for axis in value.type.tensor_type.shape.dim:
-            if axis.dim_param in (batch, points):
-                axis.dim_param = {batch: "B", points: "N"}[axis.dim_param]
-    return model
+        batch, points = (str(size) for size in program.model.graph.inputs[0].shape[:2])
+        program.rename_axes({batch: "B", points: "N"})
+        return program.model_proto.SerializeToString()
 
 
 @contextmanager

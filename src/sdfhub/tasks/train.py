@@ -55,6 +55,9 @@ NO_CONCERN = (
 )
 """Lightning's warnings that a user can do nothing about."""
 
+OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
+"""Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -68,53 +71,45 @@ class Parts:
 
 
 def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Trains what a composed config describes into a folder.
+    """Trains what a composed config describes into a folder and returns what `metrics.json` holds.
 
-    Returns:
-        What `metrics.json` holds; empty for `fast_dev_run` and for processes of a distributed run that are
-        not the first.
+    Nothing for `fast_dev_run`, and in processes of a distributed run that are not the first.
     """
     parts, written = make_parts(config, folder), plain(config)
-    refuse_processes_in_multirun(parts.trainer)
+    data, trainer = parts.data, parts.trainer
+    refuse_processes_in_multirun(trainer)
     if config.ckpt_path:
         read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
-    parts.data.prepare_data()
-    parts.data.setup("fit")
-    ids = [shape.id for shape in parts.data.train_shapes]
+    data.prepare_data()
+    data.setup("fit")
+    ids, held_out = ([shape.id for shape in role] for role in (data.train_shapes, data.held_out_shapes))
     if config.ckpt_path:
         refuse_other_shapes(Path(config.ckpt_path), ids)
-    model = parts.model(shapes=parts.data.rows)
-    begin_run(
-        folder,
-        written | {"data": with_absolute_paths(written["data"])},
-        train=ids,
-        held_out=[shape.id for shape in parts.data.held_out_shapes],
-        frames={shape.id: shape.frame for shape in parts.data.train_shapes},
-        up=parts.data.train_shapes[0].up,
-    )
+    model = parts.model(shapes=data.rows)
+    frames = {shape.id: shape.frame for shape in data.train_shapes}
+    kept = written | {"data": with_absolute_paths(written["data"])}
+    begin_run(folder, kept, ids, held_out, frames, data.train_shapes[0].up)
     log.info("run: %s", folder)
-    log_settings(parts.trainer, written)
+    for logger in trainer.loggers:
+        if not isinstance(logger, TensorBoardLogger):  # takes settings once, with the scores
+            logger.log_hyperparams(flat(written))
     fit(model, parts, config.ckpt_path)
-    if not parts.trainer.is_global_zero:
+    if not trainer.is_global_zero:
         return {}
-    if getattr(parts.trainer, "fast_dev_run", False):
+    if getattr(trainer, "fast_dev_run", False):
         log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
         return {}
     checkpoint = folder / "checkpoints" / LAST
     if not checkpoint.exists():  # callbacks without one of checkpoints
-        parts.trainer.save_checkpoint(checkpoint)
+        trainer.save_checkpoint(checkpoint)
     metrics = judge(model, parts, folder)
-    log_scores(parts.trainer, written, metrics)
+    log_scores(trainer, written, metrics)
     return metrics
 
 
 def make_parts(config: DictConfig, folder: Path) -> Parts:
-    """The objects of a training.
-
-    Raises:
-        SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
-    """
+    """The objects of a training; refuses a setting that is unknown, missing, of the wrong type or range."""
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
     torch.manual_seed(check(config.seed, Seed, "seed"))
@@ -126,21 +121,12 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
     trainer = make_trainer(config.trainer, folder, callbacks, loggers)
-    return Parts(
-        data=instantiate(config.data, "data"),
-        model=partial(AutoDecoder, **model, seed=config.seed),
-        trainer=trainer,
-        record=record,
-        evaluation=instantiate(config.evaluate, "evaluate"),
-    )
+    data, evaluation = instantiate(config.data, "data"), instantiate(config.evaluate, "evaluate")
+    return Parts(data, partial(AutoDecoder, **model, seed=config.seed), trainer, record, evaluation)
 
 
 def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
-    """The objects of a group of named parts; a part that is null is left out.
-
-    Raises:
-        SdfhubError: a part is no such object.
-    """
+    """The objects of a group of named parts, all of a Lightning `kind`; a part that is null is left out."""
     parts = []
     for name, node in (config or {}).items():
         if node is not None:
@@ -163,15 +149,13 @@ def make_trainer(
 ) -> Trainer:
     """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours.
 
-    Raises:
-        SdfhubError: names a setting that would give a wrong result, or that this machine cannot do.
+    Refuses, by its name, a setting that would give a wrong result, or that this machine cannot do.
     """
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
-        raise SdfhubError(
-            f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
-        )
+        hint = "shapes are meshed with all weights on each device; use ddp"
+        raise SdfhubError(f"trainer.strategy={config.strategy}: {hint}")
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
@@ -180,19 +164,14 @@ def make_trainer(
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
-    # what hardware there is not, advertisements, defaults of Lightning's own files
-    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
+    for name in OF_NO_CONCERN:
         logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     return instantiate(config, "trainer", **given)
 
 
 def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
-    """Trains, from a checkpoint if one is named.
-
-    Raises:
-        SdfhubError: the samples or a piece of a batch do not fit the GPU.
-    """
+    """Trains, from a checkpoint if one is named."""
     with ending_together(parts.trainer):
         try:
             parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
@@ -212,13 +191,6 @@ def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
     train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
     codes, delta = model.codes.table.detach(), model.loss.delta
     return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
-
-
-def log_settings(trainer: Trainer, config: dict[str, Any]) -> None:
-    """Gives every logger the run's settings, but TensorBoard, which takes them once, with the scores."""
-    for logger in trainer.loggers:
-        if not isinstance(logger, TensorBoardLogger):
-            logger.log_hyperparams(flat(config))
 
 
 def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:
