@@ -89,9 +89,13 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
         names: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
         program = torch.onnx.export(function, dynamo=True, verbose=False, **names)
         assert program
-        batch, points = (str(size) for size in program.model.graph.inputs[0].shape[:2])
-        program.rename_axes({batch: "B", points: "N"})
-        return program.model_proto.SerializeToString()
+        model = program.model_proto
+        values = [*model.graph.input, *model.graph.output, *model.graph.value_info]
+        axes = [axis for value in values for axis in value.type.tensor_type.shape.dim]
+        for axis, name in zip([axis.dim_param for axis in axes[:2]], "BN", strict=True):  # of `points`
+            for same in [other for other in axes if other.dim_param == axis]:
+                same.dim_param = name
+        return model.SerializeToString()
 
 
 @contextmanager

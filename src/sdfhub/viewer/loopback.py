@@ -41,11 +41,7 @@ _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, a
 
 
 class LoopbackServer(viser.ViserServer):
-    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one.
-
-    Raises:
-        SdfhubError: the port is taken.
-    """
+    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one."""
 
     def __init__(self, port: int, label: str, suffixes: Collection[str]):
         try:  # viser would go on to the next port, whoever may wait at this one
@@ -93,9 +89,9 @@ def passed(raw: bytes, suffixes: Collection[str]) -> bytes | None:
         if kind == "FileTransferStartUpload":
             size, parts = message["size_bytes"], message["part_count"]
             is_known = str(message["filename"]).lower().endswith(tuple(suffixes))
-            if not is_known or not 0 < size <= MAX_UPLOAD or parts != math.ceil(size / PART):
-                return msgspec.msgpack.encode(message | {"size_bytes": 0, "part_count": 0})
-            return raw
+            if is_known and 0 < size <= MAX_UPLOAD and parts == math.ceil(size / PART):
+                return raw
+            return msgspec.msgpack.encode(message | {"size_bytes": 0, "part_count": 0})
         is_part = kind == "FileTransferPart" and len(message["content"]) <= PART
         is_value = kind == "GuiUpdateMessage" and message["updates"].keys() == {"value"}
         return raw if is_part or is_value or kind == "ViewerCameraMessage" else None
@@ -115,18 +111,13 @@ class _Serve(sockets.serve):
                 response.headers["Content-Security-Policy"] = policy
             return response
 
-        options |= {"create_connection": partial(_Gated, suffixes), "max_size": 2 * PART, "logger": _QUIET}
+        class Gated(sockets.ServerConnection):
+            """A page's connection, of which viser sees only what passes."""
+
+            async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
+                while True:
+                    if (message := passed(await super().recv(decode=False), suffixes)) is not None:
+                        return message
+
+        options |= {"create_connection": Gated, "max_size": 2 * PART, "logger": _QUIET}
         super().__init__(*arguments, process_request=answer, **options)
-
-
-class _Gated(sockets.ServerConnection):
-    """A page's connection, of which viser sees only what passes."""
-
-    def __init__(self, suffixes: Collection[str], *arguments: Any, **options: Any):
-        super().__init__(*arguments, **options)
-        self._suffixes = suffixes
-
-    async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
-        while True:
-            if (message := passed(await super().recv(decode=False), self._suffixes)) is not None:
-                return message

@@ -42,19 +42,16 @@ STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
 
 class Viewer:
-    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves.
-
-    Attributes:
-        shapes: codes [L] by the names under which the page offers them.
-        drawn: set as soon as there is something to see.
-    """
+    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves."""
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
         self.space = space
         self.scans: dict[str, np.ndarray] = {}
+        # codes [L] by the names under which the page offers them
         self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
         self.axes = space.principal_directions[:DIRECTIONS]
-        self.drawn, self._reading, self._fitting = threading.Event(), threading.Lock(), threading.Lock()
+        self.drawn = threading.Event()  # set as soon as there is something to see
+        self._reading, self._fitting = threading.Lock(), threading.Lock()
         self.server = LoopbackServer(port, "sdfhub", FORMATS)
         self._add_scene()
         self._add_controls(title)
@@ -110,12 +107,10 @@ class Viewer:
         """How well a code fits the points of a scan's surface, and whether it is one of this space."""
         with torch.no_grad():
             distance = float(self.space.sdf(surface, code).abs().mean())
-        text = f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2."
-        if distance > FAR:
-            return f"{text} Doubtful: that is far."
-        if self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max():
-            return f"{text} Doubtful: its code is unlike those of this space's shapes."
-        return text
+        is_strange = self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max()
+        strange = " Doubtful: its code is unlike those of this space's shapes." if is_strange else ""
+        doubt = " Doubtful: that is far." if distance > FAR else strange
+        return f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2.{doubt}"
 
     def _draw(self, meshed: Meshed | SdfhubError) -> None:
         if isinstance(meshed, SdfhubError):
@@ -134,8 +129,7 @@ class Viewer:
     def _show_scan(self) -> None:
         points = self.scans.get(self.a.value)
         with self.server.atomic():
-            self.scan.visible = points is not None and self.overlay.value
-            self.overlay.visible = points is not None
+            self.scan.visible = points is not None
             if points is not None:
                 self.scan.points = points
 
@@ -175,12 +169,10 @@ class Viewer:
             upload = gui.add_upload_button("Drop a scan here, or click", mime_type=",".join(FORMATS))
             kinds = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
             self.message = gui.add_html(paragraph(kinds, "small"))
-            self.overlay = gui.add_checkbox("Show the scan's points", True, visible=False)
         self.a.on_update(lambda _: self.reset())
         for control in (self.b, self.share, *self.sliders):
             control.on_update(lambda _: self.refresh())
         reset.on_click(lambda _: self.reset())
-        self.overlay.on_update(lambda _: self._show_scan())
         upload.on_upload(lambda _: self.fit(upload.value.name, upload.value.content))
 
 
@@ -188,9 +180,6 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
     """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame.
 
     The file's name is for messages and its suffix; nothing is opened under it.
-
-    Raises:
-        SdfhubError: names the file and what is wrong with it.
     """
     suffix = PurePath(name).suffix.lower()
     if suffix not in FORMATS:
@@ -210,7 +199,7 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
 
 
 def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
-    """At most POINTS points [M, 3] of a scan's surface, in its frame: all over a mesh, or of a cloud."""
+    """At most POINTS points [M, 3] of a scan's surface, in its frame."""
     if scan.faces is None:
         return scan.points[rng.permutation(len(scan.points))[:POINTS]]
     mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
