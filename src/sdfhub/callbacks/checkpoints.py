@@ -49,10 +49,8 @@ class StopOnSignal(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._signal, self._step = None, trainer.global_step
         numbers = [signal.SIGTERM, signal.SIGINT]
-        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
-            numbers.append(signal.SIGHUP)
-        if "SLURM_JOB_ID" in os.environ:
-            numbers.append(signal.SIGUSR1)
+        numbers += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []  # nohup
+        numbers += [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
         if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
             self._handlers = {number: signal.signal(number, self._receive) for number in numbers}
 
@@ -65,9 +63,8 @@ class StopOnSignal(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
         before, self._step = self._step, trainer.global_step
-        if self._step == before:
-            return  # the gradient is still accumulated
-        if not trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
+        is_whole = self._step != before  # else the gradient is still accumulated
+        if not (is_whole and trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False)):
             return
         self._save(trainer)
         log.warning("stopped after step %d: %s", trainer.global_step, self.path)

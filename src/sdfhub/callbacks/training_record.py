@@ -40,13 +40,13 @@ class TrainingRecord(L.Callback):
         self._seconds, self._started = self._so_far(), None
         return was_running
 
-    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
+    def on_validation_start(self, *_: Any) -> None:
         self.stop_clock()
 
-    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
+    def on_validation_end(self, *_: Any) -> None:
         self._started = time.perf_counter() if self.stepped else None
 
-    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+    def on_train_end(self, *_: Any) -> None:
         self.stop_clock()
 
     def _so_far(self) -> float:

@@ -42,7 +42,7 @@ STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
 
 class Viewer:
-    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves."""
+    """The page of a space, its grid of `resolution` points along an axis when nothing moves."""
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
         self.space = space
