@@ -27,8 +27,7 @@ from runs import head, row
 
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.search import objective
-from sdfhub.report.plan import read_plan
-from sdfhub.report.results import Scores, read_scores, read_sweep
+from sdfhub.report.results import Scores, read_plan, read_scores, read_sweep
 from sdfhub.settings import flat
 from sdfhub.whole_file import write_whole
 

@@ -24,8 +24,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.locks import is_locked, locked
 from sdfhub.report.charts import shape_chart
 from sdfhub.report.pictures import ShownMesh, contact_sheet_of, packed, reconstruction
-from sdfhub.report.plan import PLAN, enter_cells, read_plan
-from sdfhub.report.results import ShapeScore, read_sweep
+from sdfhub.report.results import PLAN, ShapeScore, enter_cells, read_plan, read_sweep
 from sdfhub.report.rows import group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import latex, markdown, origin, overview, tables
 from sdfhub.tasks import report as report_task

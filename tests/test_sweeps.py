@@ -10,8 +10,7 @@ from hydra.types import RunMode
 
 from sdfhub.multirun.cells import finished
 from sdfhub.multirun.sweep import planned_cells
-from sdfhub.report.plan import PlannedCell
-from sdfhub.report.results import Cell, read_sweep
+from sdfhub.report.results import Cell, PlannedCell, read_sweep
 from sdfhub.report.rows import group_cells
 from tests.stand_in_training import CONF, of_multirun, stand_in
 

@@ -15,8 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from sdfhub.composition import plain
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import choices_of
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
-from sdfhub.report.results import read_scores
+from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_scores
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sdfhub.multirun.cells import planned_cell
 from sdfhub.multirun.names import register_resolvers
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
+from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
 from sdfhub.opening import begin_run, load
-from sdfhub.report.plan import first_fault
+from sdfhub.report.results import first_fault
 
 log = logging.getLogger(__name__)
 

@@ -21,8 +21,7 @@ from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.opening import data_of
 from sdfhub.report.charts import charts
 from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, picture_uri
-from sdfhub.report.plan import read_plan
-from sdfhub.report.results import Cell, read_sweep
+from sdfhub.report.results import Cell, read_plan, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
 from sdfhub.whole_file import refuse_unwritable, write_whole

@@ -4,6 +4,7 @@ import logging
 import warnings
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -14,6 +15,7 @@ from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
@@ -30,11 +32,9 @@ from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
 from sdfhub.multirun.cells import go_on, run_cell
-from sdfhub.multirun.processes import ending_together, refuse_processes_in_multirun
 from sdfhub.multirun.search import objective
-from sdfhub.opening import begin_run
-from sdfhub.settings import flat
-from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
+from sdfhub.opening import begin_run, read_run
+from sdfhub.settings import WHERE_NOT_WHAT, flat
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +57,10 @@ NO_CONCERN = (
 
 OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
 """Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
+
+
+FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
+"""Settings that change neither the model nor its data: a run may go on with others."""
 
 
 @dataclass(frozen=True)
@@ -171,15 +175,55 @@ def make_trainer(
 
 
 def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
-    """Trains, from a checkpoint if one is named."""
-    with ending_together(parts.trainer):
-        try:
-            parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
-        except torch.OutOfMemoryError as error:
+    """Trains, from a checkpoint if one is named; ends together with the other processes of the run."""
+    try:
+        parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
+    except torch.OutOfMemoryError as error:
+        raise SdfhubError(
+            "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
+            "data.loader.resident=false leaves the samples on the disk"
+        ) from error
+    except SIGTERMException as stop:
+        raise SystemExit(143) from stop  # Lightning's has status 0
+    except RuntimeError as error:  # gloo raises it bare, NCCL a kind of it
+        is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
+        if parts.trainer.world_size > 1 and is_loss:
+            lost = "another process of this run has died; continue from its last checkpoint"
+            raise SdfhubError(lost) from error
+        raise
+
+
+def refuse_processes_in_multirun(trainer: Trainer) -> None:
+    """Refuses a cell whose trainer would start processes: each of them would walk the whole multirun."""
+    cluster = getattr(trainer.strategy, "cluster_environment", None)
+    starts = trainer.world_size > 1 and not (cluster and cluster.creates_processes_externally)
+    if starts and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        hint = "a cell of a multirun has one device, or processes of SLURM; set 1"
+        raise SdfhubError(f"trainer.devices: {hint}")
+
+
+def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
+    """Refuses to continue a checkpoint under settings that its training did not have, and names them."""
+    folder = checkpoint.parent.parent
+    if not (folder / "config.yaml").is_file():
+        return
+    then, now = flat(read_run(folder)[0]), flat(config)
+    keys = sorted(key for key in then | now if not key.startswith(FREE_TO_CHANGE))
+    differing = [f"{k}={then.get(k)} (now {now.get(k)})" for k in keys if then.get(k) != now.get(k)]
+    if differing:
+        raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
+
+
+def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
+    """Refuses to continue a checkpoint where data= now offers other shapes: a code is known by its row."""
+    folder = checkpoint.parent.parent
+    then = read_run(folder)[1]["train"] if (folder / "split.json").is_file() else ids
+    for row, (before, now) in enumerate(zip_longest(then, ids, fillvalue="none")):
+        if before != now:
             raise SdfhubError(
-                "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
-                "data.loader.resident=false leaves the samples on the disk"
-            ) from error
+                f"ckpt_path={checkpoint}: the shapes that data= offers have changed: code {row} is that of "
+                f"{before}, now it would be that of {now}; bring them back, or train anew"
+            )
 
 
 def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
