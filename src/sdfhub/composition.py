@@ -35,13 +35,7 @@ def one_line(error: BaseException) -> str:
 def instantiate(config: Any, key: str, **given: Any) -> Any:
     """The object that a node of the user's own config describes: `hydra.utils.instantiate`, checked before.
 
-    Args:
-        config: a node with `_target_`, or a mapping or list of such; None stays None.
-        key: where it stands in the config, for messages.
-        given: arguments that come from code.
-
-    Raises:
-        SdfhubError: no such class or argument, a value of the wrong type, or what the class says of it.
+    `key` is where it stands in the config, for messages; `given` are arguments that come from code.
     """
     node = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     _check(node, key, given)

@@ -1,4 +1,4 @@
-"""What a page shows of shapes: contact sheets, and meshes to turn; truth and reconstructions in one frame."""
+"""What a page shows: contact sheets and meshes to turn, truth and reconstructions in one frame; curves."""
 
 import base64
 import io
@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import fast_simplification
+import matplotlib
 import numpy as np
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.render import render
@@ -164,3 +167,43 @@ def picture_uri(image: np.ndarray) -> str:
     content = io.BytesIO()
     Image.fromarray(image).save(content, "WEBP", quality=82)
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "sdfhub", "font.size": 9}
+STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, "axes.spines.right": False}
+
+
+@matplotlib.rc_context(STYLE)
+def loss_chart(group: Group) -> str | None:
+    """Loss of signed distances by step, a line a seed, as an SVG's data URI; None without any."""
+    figure = Figure((7.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for index, row in enumerate(group.rows):
+        label = (row.label if len(row.label) < 60 else f"{row.label[:58]}…").replace(
+            "$", r"\$"
+        )  # no formulas
+        for curve in filter(None, (loss_curve(cell.folder) for cell in row.done)):
+            line = "-" if row.normals == "on" else "--"
+            axes.plot(*zip(*curve, strict=True), color=f"C{index % 10}", ls=line, lw=1.3, label=label)
+            label = ""
+    if not axes.lines:
+        return None
+    axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
+    axes.legend(frameon=False, fontsize=8)
+    content = io.BytesIO()
+    figure.savefig(content, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tuple[int, float]]:
+    """A logged value by step where above 0, thinned out to so many points; [] where it cannot be read."""
+    folder = run / "tensorboard"
+    if not folder.resolve().is_relative_to(run.resolve()):
+        return []
+    try:
+        keep = {"scalars": 0, "images": 1, "tensors": 1}  # of each tag; 0 is all
+        scalars = EventAccumulator(str(folder), size_guidance=keep).Reload().Scalars(tag)
+    except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
+        return []
+    curve = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
+    return curve[:: max(1, -(-len(curve) // points))]

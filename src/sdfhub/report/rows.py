@@ -27,7 +27,7 @@ COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 NONE = "–"  # what tables show where there is nothing
 
 
-@dataclass(frozen=True)
+@dataclass
 class Row:
     """A method in a group of comparable cells, one a seed."""
 
@@ -36,63 +36,44 @@ class Row:
     detail: str  # what else tells the row from others of its method; mostly empty
     cells: list[Cell]
 
-    @property
-    def label(self) -> str:
-        """Method, normals unless it is DeepSDF without them, and detail, in one line."""
+    def __post_init__(self) -> None:
         words = {"on": " + normals", "off": ", no normals" if self.method != "DeepSDF" else ""}
-        return self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
-
-    @property
-    def done(self) -> list[Cell]:
-        """The finished cells."""
-        return [cell for cell in self.cells if cell.state == "done"]
-
-    @property
-    def first(self) -> Cell | None:
-        """The first finished cell."""
-        return next(iter(self.done), None)
-
-    @property
-    def state(self) -> str:
-        """What stands for the row where no cell is finished: `failed` or `missing`."""
-        return "failed" if any(cell.state == "failed" for cell in self.cells) else "missing"
-
-    @property
-    def searched(self) -> str:
-        """What search the settings come from, as the experiment's config says."""
-        return str(self.first.scores.config.get("searched") or "no")[:200] if self.first else NONE
+        self.label = self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
+        self.done = [cell for cell in self.cells if cell.state == "done"]
+        self.first = self.done[0] if self.done else None
+        # what stands for a row without finished cells, and what search its settings come from
+        self.state = "failed" if any(cell.state == "failed" for cell in self.cells) else "missing"
+        self.names = {
+            "method": self.method,
+            "normals": self.normals,
+            "detail": self.detail,
+            "label": self.label,
+        }
+        self.searched = str(self.done[0].scores.config.get("searched") or "no")[:200] if self.done else NONE
 
 
-@dataclass(frozen=True)
+@dataclass
 class Group:
     """Rows that may be compared: the same sweep, shapes, scale and way of judging."""
 
     judging: dict[str, str]  # options of JUDGING_GROUPS, values of JUDGING_SETTINGS on the command line
     rows: list[Row]  # in the order of the commands, each with normals first
 
-    @property
-    def first(self) -> Cell | None:
-        """The first finished cell."""
-        return next((row.first for row in self.rows if row.first), None)
-
-    @property
-    def settings(self) -> list[str]:
-        """What of `judging` the command line set, as `key=value`."""
-        return [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
-
-    @property
-    def title(self) -> list[str]:
-        """Words such as `chairs`, `data=open`, `scale=cpu`, `evaluate=paper`, `trained on 20`."""
-        parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
-        counts = sorted({cell.scores.trained_on for row in self.rows for cell in row.done})
+    def __post_init__(self) -> None:
+        done = [cell for row in self.rows for cell in row.done]
+        self.first = done[0] if done else None
+        self.settings = [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
+        counts = sorted({cell.scores.trained_on for cell in done})
         ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
-        return [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
+        parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
+        # words such as `chairs`, `data=open`, `scale=cpu`, `evaluate=paper`, `trained on 20`
+        self.title = [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
         """MEASURES of each judged shape, distances times 10^3; `cd` is that of a point where nothing is."""
         records = [
-            vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
+            row.names | {"cell": cell.plan.folder, "seed": cell.plan.seed}
             | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
@@ -176,7 +157,7 @@ def _rows(cells: list[Cell]) -> list[Row]:
         changed = differing([settings_of(part[0]) for part in parts])
         for number, part in enumerate(parts):
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
-            detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
+            detail = ", ".join(f"{key}={value}" for key, value in words.items())
             row = Row(*_name(plan.choices), detail, part)
             twins = sum(row.label == rival.label for rival in rows)  # labels name rows: no two are equal
             rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
@@ -201,24 +182,15 @@ def _name(choices: dict[str, str]) -> tuple[str, str]:
     return PREFIXES.get(encoding, f"{encoding.upper()}/") + method, choices.get("normals", "?")
 
 
-def _short(value: str) -> str:
-    """A number of more than six characters to five digits: a search draws them with sixteen."""
-    try:
-        return f"{float(value):.5g}" if len(value) > 6 else value
-    except ValueError:
-        return value
-
-
 def table_csv(groups: list[Group]) -> str:
     """Every row of every group as numbers: a line a role, `Group.statistics` and `Group.costs` in it."""
     frames = [pd.DataFrame({"label": []})]
     for group in groups:
         rows = [
-            _place(group) | vars(row) | {"label": row.label, "searched": row.searched}
-            | {"cells": len(row.cells), "role": role}
+            _place(group) | row.names | {"cells": len(row.cells), "searched": row.searched, "role": role}
             for row in group.rows
             for role in ROLES
-        ]  # fmt: skip
+        ]
         numbers = pd.DataFrame(rows).join(group.statistics, on=["label", "role"])
         frames.append(numbers.join(group.costs, on="label"))
     return pd.concat(frames[1:] or frames).to_csv(index=False, float_format="%.9g")

@@ -22,17 +22,12 @@ DISTANCES |= {"signs right": "sign_accuracy_mean"}
 
 LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
-ABOUT_CD = (
-    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
-    "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
-    "between those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: "
-    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the "
-    "lowest, however near others are."
-)
-ABOUT_DISTANCES = (
-    "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
-    "samples near its surface, then over shapes; signs right: share of samples."
-)
+ABOUT_CD = """CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two
+samplings of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos|
+between those of reconstruction and truth, of shapes with a surface. ± is a 95% confidence interval over seeds
+(Student's t); bold: the lowest, however near others are."""
+ABOUT_DISTANCES = """The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a
+shape's samples near its surface, then over shapes; signs right: share of samples."""
 ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
 ABOUT_COSTS = (
     "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
@@ -51,12 +46,10 @@ class Table:
     prose: bool = False  # whether cells are words, to be set flush left
 
 
-KINDS = (("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES))
-
-
 def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
-    scores = [_scores(group, role, *kind) for role in ROLES for kind in KINDS]
+    kinds = (("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES))
+    scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
     return [table for table in (*scores, _settings(group), _costs(group), _absent(group)) if table]
 
 
@@ -153,7 +146,7 @@ def _frame(group: Group, columns: dict[str, list[str]]) -> pd.DataFrame:
 def _texts(lines: pd.DataFrame, quantity: str, interval: bool = True) -> list[str]:
     """A column as text with its intervals, four places below 10 and two above."""
     texts = []
-    for mean, half in zip(lines[quantity], lines[f"{quantity}_ci95"], strict=True):
+    for mean, half in lines[[quantity, f"{quantity}_ci95"]].to_numpy():
         places = 4 if abs(mean) < 10 else 2
         spread = f" ± {half:.{places}f}" if interval and half >= 0.5 * 10**-places else ""
         texts.append(NONE if pd.isna(mean) else f"{mean:.{places}f}{spread}")

@@ -21,13 +21,8 @@ def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> No
     """Composes `config_name` with the command line's overrides and runs `task` on it.
 
     Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C; 1 where
-    Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
-
-    Args:
-        task: given each composed config.
-        config_name: a YAML of conf/.
-        positional: keys that words without `=` stand for, in their order; a last one that ends with `...`
-            takes all that are left.
+    Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks. `positional` are
+    the names of words without `=`, as `words_to_overrides` takes them.
     """
     sys.argv[1:] = words_to_overrides(sys.argv[1:], positional)
     register_resolvers()

@@ -19,8 +19,7 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.opening import data_of
-from sdfhub.report.charts import charts
-from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, picture_uri
+from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, loss_chart, picture_uri
 from sdfhub.report.results import Cell, read_plan, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
@@ -47,7 +46,7 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
             {
                 "title": ", ".join(group.title),
                 "tables": tables(group),
-                "charts": charts(group),
+                "chart": loss_chart(group),
                 "sheet": sheet,
             }
         )
