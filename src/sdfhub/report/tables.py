@@ -22,16 +22,16 @@ DISTANCES |= {"signs right": "sign_accuracy_mean"}
 
 LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
-ABOUT_CD = """CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two
-samplings of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos|
-between those of reconstruction and truth, of shapes with a surface. ± is a 95% confidence interval over seeds
-(Student's t); bold: the lowest, however near others are."""
-ABOUT_DISTANCES = """The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a
-shape's samples near its surface, then over shapes; signs right: share of samples."""
-ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
-ABOUT_COSTS = (
-    "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
+ABOUT_CD = (
+    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings of "
+    "the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| between those "
+    "of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest."
 )
+ABOUT_DISTANCES = (
+    "No meshes, no CD. |f - d| times 10³, over samples near a shape's surface, then over shapes."
+)
+ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
+ABOUT_COSTS = "Samples are signed distances drawn in all. Times compare on one idle machine."
 ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
 
 

@@ -12,8 +12,8 @@ TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir",
 def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     """A command line's words, in which positional ones have become `name=value`.
 
-    Names that the line also gives as `name=value` are left out; the last may end with `...` and takes any number
-    of words. Words beyond the names stay as they are, for Hydra to refuse.
+    Names that the line also gives as `name=value` are left out; the last may end with `...` and takes any
+    number of words. Words beyond the names stay as they are, for Hydra to refuse.
 
     >>> words_to_overrides(["my run", "a.ply", "b,c.ply", "frame=unknown"], ["run", "scans..."])
     ["run='my run'", 'frame=unknown', "scans=['a.ply','b,c.ply']"]
