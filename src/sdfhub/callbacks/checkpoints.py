@@ -34,10 +34,7 @@ class StopOnSignal(L.Callback):
 
     SIGTERM, SIGINT and SIGHUP end the process with status 143, 130 and 129, as the shell counts them; a
     second signal ends it at once. SIGUSR1 under SLURM (`sbatch --signal=USR1@120`) also has the job put back
-    into the queue. With `accumulate_grad_batches` a step has several batches.
-
-    Args:
-        dirpath: folder of the checkpoints.
+    into the queue. With `accumulate_grad_batches` a step has several batches. `dirpath` has the checkpoints.
     """
 
     def __init__(self, dirpath: str | Path):

@@ -69,13 +69,9 @@ class Sheet(NamedTuple):
 
 
 def contact_sheet_of(group: Group, count: int, room: int, find_truth: FindTruth) -> Sheet:
-    """Truth, then each row of a group, for some shapes: the paper's figures 2 to 6.
+    """Truth, then each row of a group, for `count` shapes: the paper's figures 2 to 6.
 
-    Args:
-        group: its rows are shown by their first finished cells.
-        count: shapes to show.
-        room: bytes that the meshes to turn may take on the page.
-        find_truth: finds the true shapes.
+    Rows are shown by their first finished cells; the meshes to turn take some `room` bytes of the page.
     """
     shapes, to_turn = chosen(group, count), chosen(group, min(count, TO_TURN))
     triangles = room // max(1, len(to_turn) * (len(group.rows) + 1) * 12)  # some 12 bytes each, as base64
@@ -90,9 +86,12 @@ def contact_sheet_of(group: Group, count: int, room: int, find_truth: FindTruth)
     rows = [
         (row.label, [tile(shape, *_shown(row, *shape, find_truth)) for shape in shapes]) for row in group.rows
     ]
-    truths = [true_mesh(find_truth(group.first, id)) for _, id in shapes] if group.first else []
-    if any(truths):
-        tiles = [tile(s, "" if mesh else "no truth", mesh) for s, mesh in zip(shapes, truths, strict=True)]
+    truths = [find_truth(group.first, id) for _, id in shapes] if group.first else []
+    true = [ShownMesh(t.mesh.vertices, t.mesh.faces, t.up) if t and t.mesh else None for t in truths]
+    if any(true):
+        tiles = [
+            tile(shape, "" if mesh else "no truth", mesh) for shape, mesh in zip(shapes, true, strict=True)
+        ]
         rows.insert(0, ("Ground truth", tiles))
     return Sheet(shapes, rows)
 
@@ -106,12 +105,6 @@ def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> tuple[str, Sh
         return "no surface" if score else "not judged", None
     mesh = reconstruction(row.first.folder, role, score, find_truth(row.first, id))
     return f"CD {score.counted_cd * TABLE_UNIT:.3f}" if mesh else "no mesh", mesh
-
-
-def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
-    """The true mesh; None where it cannot be had."""
-    mesh = truth.mesh if truth else None
-    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if truth and mesh else None
 
 
 def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
@@ -135,10 +128,9 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
 
 
 def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
-    """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
+    """A mesh of at most about `triangles`, +z up, as counts of `vertices` and `faces` and base64 `data`:
 
-    Returns:
-        `vertices` and `faces`: counts; `data`: positions times 32767 (int16), then indices (uint16).
+    little-endian positions times 32767 (int16), then indices (uint16).
     """
     vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
     if len(faces) > triangles:

@@ -23,9 +23,9 @@ DISTANCES |= {"signs right": "sign_accuracy_mean"}
 LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
 
 ABOUT_CD = (
-    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings of "
-    "the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| between those "
-    "of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t); bold: the lowest."
+    "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
+    "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
+    "between those of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t)."
 )
 ABOUT_DISTANCES = (
     "No meshes, no CD. |f - d| times 10³, over samples near a shape's surface, then over shapes."

@@ -51,11 +51,7 @@ def data_again(run: Path, config: DictConfig) -> tuple[dict[str, Any], SdfDataMo
 def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig) -> Split:
     """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
 
-    Args:
-        source: offers them.
-        trained: ids by role in the run; none where another source or other settings of it are judged.
-        seen: ids that were trained on: never judged as unseen ones.
-        config: the task's.
+    `trained` are the run's ids by role, none where other data are judged; `seen` are never judged as unseen.
     """
     offered = {shape.id: shape for shape in source.shapes()}
     ids = check(plain(config)["shapes"], list[str] | None, "shapes")
