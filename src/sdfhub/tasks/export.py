@@ -6,10 +6,11 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from omegaconf import DictConfig
+from pydantic import Field
 from torch.export import Dim
 from tqdm import tqdm
 
@@ -48,20 +49,19 @@ def export(config: DictConfig) -> None:
 def export_meshes(config: DictConfig, folder: Path) -> None:
     """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
     suffix = check(config.format, Literal[FORMATS], "format")
-    chosen = check(plain(config)["shapes"], list[str | int] | str | int | None, "shapes")
+    shapes = Annotated[list[str | int], Field(min_length=1)] | str | int | None
+    chosen = check(plain(config)["shapes"], shapes, "shapes")
     chosen = [chosen] if isinstance(chosen, str | int) else chosen
     space = load(config.run, trust=config.trust or ())
-    rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]
-    if not rows:
-        raise SdfhubError("shapes=[]: name at least one, or null for all")
+    ids = [space.ids[space.row(shape)] for shape in chosen or space.ids]
     empty = []
-    meshes = tqdm(space.meshes(list(rows), config.resolution), total=len(rows), unit="shape", disable=None)
-    for row, (vertices, faces) in zip(rows, meshes, strict=True):
-        write_mesh(vertices, faces, folder / "meshes" / f"{space.ids[row]}.{suffix}")
-        empty += [] if len(faces) else [space.ids[row]]
-    is_known = all(space.ids[row] in space.frames for row in rows)
+    meshes = tqdm(space.meshes(ids, config.resolution), total=len(ids), unit="shape", disable=None)
+    for id, (vertices, faces) in zip(ids, meshes, strict=True):
+        write_mesh(vertices, faces, folder / "meshes" / f"{id}.{suffix}")
+        empty += [] if len(faces) else [id]
+    is_known = space.frames.keys() >= set(ids)
     frame = "their source's frame" if is_known else "the normalised frame: the run does not know its source's"
-    print(f"meshes:    {folder / 'meshes'}: {len(rows) - len(empty)} in {frame}")
+    print(f"meshes:    {folder / 'meshes'}: {len(ids) - len(empty)} in {frame}")
     if empty:
         print(f"without a surface: {', '.join(empty)}")
 

@@ -1,7 +1,4 @@
-"""A page of shapes to see, turn, mix and fit to a scan.
-
-A code is shown: between the shapes A and B, moved along the principal directions of the codes.
-"""
+"""A page of a code's shape: between shapes A and B, moved along principal directions, or fitted to a scan."""
 
 import html
 import threading
@@ -11,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.geometry.up_axis import turned_up
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
@@ -79,7 +76,10 @@ class Viewer:
         """Back to the shape A itself."""
         for slider in (self.share, *self.sliders):
             slider.value = 0.0
-        self._show_scan()
+        points = self.scans.get(self.a.value)
+        with self.server.atomic():
+            self.scan.visible = points is not None
+            self.scan.points = np.zeros((1, 3)) if points is None else points
         self.refresh()
 
     def fit(self, name: str, content: bytes) -> None:
@@ -126,13 +126,6 @@ class Viewer:
                 self.name.content = paragraph(meshed.about, "name") + text
         self.drawn.set()
 
-    def _show_scan(self) -> None:
-        points = self.scans.get(self.a.value)
-        with self.server.atomic():
-            self.scan.visible = points is not None
-            if points is not None:
-                self.scan.points = points
-
     def _show_message(self, text: str, kind: str = "small") -> None:
         self.message.content = paragraph(text, kind)
 
@@ -156,10 +149,9 @@ class Viewer:
         gui.add_html(f"<style>{STYLE}</style>" + paragraph(title, "title") + paragraph(size, "small"))
         self.name = gui.add_html(paragraph("…", "name"))
         with gui.add_folder("Shape"):
-            self.a: Any = gui.add_dropdown("A", names, hint="What is shown; type to search")
+            self.a: Any = gui.add_dropdown("A", names)
             self.b: Any = gui.add_dropdown("B", names, initial_value=names[1])
-            hint = "On the line between their codes"
-            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint=hint)
+            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0)
         with gui.add_folder("Principal directions"):
             hint = "Standard deviations of the codes along this axis; 0 is the shape above"
             axes = range(1, len(self.axes) + 1)
@@ -202,8 +194,7 @@ def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
     """At most POINTS points [M, 3] of a scan's surface, in its frame."""
     if scan.faces is None:
         return scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
-    return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])
+    return sample_surface(scan.points, scan.faces, POINTS, rng)[0]
 
 
 def bounded(value: float, low: float, high: float) -> float:
