@@ -17,10 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class WholeFileIO(TorchCheckpointIO):
-    """Writes a checkpoint whole or not at all; reads none that is damaged.
-
-    Lightning's own writer copies across file systems: a kill leaves half a file where the last good one was.
-    """
+    """Writes a checkpoint whole or not at all, also across file systems; reads none that is damaged."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         write_checkpoint(checkpoint, Path(path))

@@ -67,7 +67,6 @@ class MeshShapes(ShapesShown):
     Shapes without a true mesh are skipped. A field without a surface counts in `mesh/failed`.
 
     Args:
-        times, shapes: as for `ShapesShown`.
         resolution, points: along an axis of the marching-cubes grid; a side of the Chamfer distance.
     """
 

@@ -29,10 +29,9 @@ log = logging.getLogger(__name__)
 
 
 def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, Any]:
-    """Trains a cell of a multirun unless it is finished and returns what `metrics.json` holds.
+    """Trains a cell of a multirun unless it is finished; returns what `metrics.json` holds.
 
-    A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher. It, or
-    one that another process trains, returns {}.
+    A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher.
     """
     folder = Path(hydra.runtime.output_dir)
     # ddp processes that SLURM or torchrun started train a cell together: the first holds the lock for all

@@ -46,14 +46,11 @@ def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
 
 
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
-    """Folder name of a multirun, where the same command finds its cells again; `otherwise` without a sweep.
-
-    That of a search has a digest of all settings: the objectives of its trainings are compared.
-    """
+    """Folder name of a multirun, where the same command finds its cells again; `otherwise` without a sweep."""
     choices = _root_.hydra.runtime.choices
     if choices.get("hparams_search"):
         name = run_name(_root_=_root_, groups=("hparams_search", "data", "category", "scale"))
-        return f"search_{name}_{_digest(_root_)}"
+        return f"search_{name}_{_digest(_root_)}"  # the objectives of its trainings are compared
     return choices.get("sweeps") or otherwise
 
 

@@ -71,8 +71,7 @@ def first_fault(error: ValidationError) -> str:
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
     """Adds cells to `sweep.json`, and the command that asked for them. Safe side by side.
 
-    A cell whose settings have changed is replaced. Of cells with one folder the one with the fewest settings
-    stays: the others name defaults.
+    Cells of other settings are replaced; of those with one folder the one that names fewest defaults stays.
     """
     sweep.mkdir(parents=True, exist_ok=True)
     with locked(sweep / ".lock"):

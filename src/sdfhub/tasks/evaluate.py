@@ -49,10 +49,7 @@ def data_again(run: Path, config: DictConfig) -> tuple[dict[str, Any], SdfDataMo
 
 
 def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig) -> Split:
-    """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
-
-    `trained` are the run's ids by role, none where other data are judged; `seen` are never judged as unseen.
-    """
+    """The shapes to judge: the run's (`trained`), those that `shapes` names, or unseen ones, none of `seen`."""
     offered = {shape.id: shape for shape in source.shapes()}
     ids = check(plain(config)["shapes"], list[str] | None, "shapes")
     count = check(config.held_out, int | None, "held_out")

@@ -64,10 +64,9 @@ def neighbours(config: DictConfig) -> None:
 def write_gallery(
     space: Space, codes: Tensor, captions: Sequence[str], out: Path, resolution: int, animated: bool = False
 ) -> None:
-    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` and, where asked for, `animation.gif`.
+    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` and, of steps on a way, `animation.gif`.
 
-    All lie in the normalised frame: a code [S, L] between two shapes, or a new one, has no source. Steps of a
-    way, which are `animated`, stay in one line.
+    All lie in the normalised frame: a code [S, L] between two shapes, or a new one, has no source.
     """
     results = reconstruct(space.decoder, codes, resolution)
     meshes = list(tqdm(results, "meshing", len(codes), leave=False, disable=None))

@@ -182,11 +182,7 @@ def _read(path: Path, key: str) -> Any:
 
 
 def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> list[str]:
-    """Names of the shapes in the order of their codes: paths below its data's folder, or numbers.
-
-    `TrainSplit` is relative to the experiment's folder, to one above it, or to the present one; `split`,
-    where given, stands in for it.
-    """
+    """Names of the shapes in the order of their codes, from `split` or the experiment's own file, or numbers."""
     above = [Path(), folder.resolve(), *folder.resolve().parents]
     places = [Path(split)] if split else [at / specs.TrainSplit for at in above if specs.TrainSplit]
     file = next((place for place in places if split or place.is_file()), None)

@@ -31,10 +31,7 @@ MESH_BYTES = 4_000_000  # room for the meshes to turn on a page
 
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> list[Cell]:
-    """Writes tables (md, tex, csv), `shapes.csv`, a sheet a group and `report.html`; prints the tables.
-
-    Returns the cells of the sweep, finished or not, of which `shapes` shapes are pictured side by side.
-    """
+    """Writes tables, sheets of so many shapes and `report.html`; prints the tables; returns the cells."""
     cells = read_sweep(sweep)
     groups, find_truth = group_cells(cells), truth_finder()
     before, after = overview(groups), [origin(read_plan(sweep).commands, cells)]

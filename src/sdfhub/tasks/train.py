@@ -40,10 +40,9 @@ log = logging.getLogger(__name__)
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
+# half precision needs a loss scale; pieces of a batch are differentiated without one
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
-"""Half precision needs a loss scale; pieces of a batch are differentiated without one."""
-WHOLE_MODEL = ("auto", "ddp")
-"""Beginnings of the strategies that leave every weight on every device, as meshing and judging need."""
+WHOLE_MODEL = ("auto", "ddp")  # strategies that leave every weight on every device, as meshing needs
 
 NO_CONCERN = (
     ".*does not have many workers.*",
@@ -75,10 +74,7 @@ class Parts:
 
 
 def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Trains what a composed config describes into a folder and returns what `metrics.json` holds.
-
-    Nothing for `fast_dev_run`, and in processes of a distributed run that are not the first.
-    """
+    """Trains what a config describes into a folder; returns what `metrics.json` holds, in the first process."""
     parts, written = make_parts(config, folder), plain(config)
     data, trainer = parts.data, parts.trainer
     refuse_processes_in_multirun(trainer)
@@ -151,10 +147,7 @@ def make_optimisation(config: DictConfig) -> Optimisation:
 def make_trainer(
     config: DictConfig, folder: Path, callbacks: list[Callback], loggers: list[Logger]
 ) -> Trainer:
-    """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours.
-
-    Refuses, by its name, a setting that would give a wrong result, or that this machine cannot do.
-    """
+    """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours."""
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):

@@ -6,9 +6,7 @@ Here a page comes from this server on a loopback address or is refused, there is
 messages only those pass that the page needs.
 """
 
-import contextlib
 import http
-import io
 import logging
 import math
 import socket
@@ -51,15 +49,9 @@ class LoopbackServer(viser.ViserServer):
         plain = sockets.serve
         sockets.serve = partial(_Serve, suffixes)  # type: ignore[misc, assignment]  # viser has no option for it
         try:
-            with contextlib.redirect_stdout(io.StringIO()):
-                super().__init__(host=HOST, port=port, label=label, verbose=False)
+            super().__init__(host=HOST, port=port, label=label, verbose=False)
         finally:
             sockets.serve = plain  # type: ignore[misc]
-
-    def stop(self) -> None:
-        """Ends it, without viser's announcement."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().stop()
 
 
 def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
@@ -79,10 +71,7 @@ def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
 
 
 def passed(raw: bytes, suffixes: Collection[str]) -> bytes | None:
-    """A page's message as viser shall see it; None where it shall not.
-
-    Values of controls, the camera and parts of files pass; a file too large or of another type arrives empty.
-    """
+    """A page's message as viser shall see it, or None; a file too large or of another type arrives empty."""
     try:
         message: dict[str, Any] = msgspec.msgpack.decode(raw)
         kind = message["type"]

@@ -169,10 +169,7 @@ class Viewer:
 
 
 def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
-    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame.
-
-    The file's name is for messages and its suffix; nothing is opened under it.
-    """
+    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame."""
     suffix = PurePath(name).suffix.lower()
     if suffix not in FORMATS:
         raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
