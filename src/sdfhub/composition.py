@@ -59,7 +59,7 @@ def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A config as plain data, interpolations resolved but `${oc.env:NAME}`: an environment holds passwords."""
+    """A config as plain data, interpolations resolved but `${oc.env:NAME}`, which may be a password."""
     written = lambda *words: "${oc.env:" + ",".join(map(str, words)) + "}"  # noqa: E731
     OmegaConf.register_new_resolver("oc.env", written, replace=True)
     try:

@@ -46,7 +46,7 @@ def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
 
 
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
-    """Folder name of a multirun, where the same command finds its cells again; `otherwise` without a sweep."""
+    """Folder name of a multirun, where its command finds its cells again; `otherwise` without a sweep."""
     choices = _root_.hydra.runtime.choices
     if choices.get("hparams_search"):
         name = run_name(_root_=_root_, groups=("hparams_search", "data", "category", "scale"))

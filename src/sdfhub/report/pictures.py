@@ -69,7 +69,7 @@ class Sheet(NamedTuple):
 
 
 def contact_sheet_of(group: Group, count: int, room: int, find_truth: FindTruth) -> Sheet:
-    """Truth, then each row's first finished cell, for `count` shapes; meshes to turn take some `room` bytes."""
+    """Truth, then each row's first finished cell, for `count` shapes; meshes to turn take `room` bytes."""
     shapes, to_turn = chosen(group, count), chosen(group, min(count, TO_TURN))
     triangles = room // max(1, len(to_turn) * (len(group.rows) + 1) * 12)  # some 12 bytes each, as base64
     triangles = min(MOST, max(FEWEST, triangles))
@@ -105,7 +105,7 @@ def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> tuple[str, Sh
 
 
 def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
-    """The reconstruction of a shape in a cell's folder, or None; without truth its own extent is its frame."""
+    """The reconstruction of a shape in a cell's folder, or None; without truth its extent is its frame."""
     path = cell / "meshes" / role / f"{score.id}.ply"
     if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
@@ -122,7 +122,7 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
 
 
 def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
-    """A mesh of at most about `triangles`, +z up; `data`: positions * 32767 (int16), then indices (uint16)."""
+    """A mesh of at most about `triangles`, +z up; `data`: positions * 32767 (int16), indices (uint16)."""
     vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
     if len(faces) > triangles:
         vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))

@@ -49,7 +49,7 @@ def data_again(run: Path, config: DictConfig) -> tuple[dict[str, Any], SdfDataMo
 
 
 def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig) -> Split:
-    """The shapes to judge: the run's (`trained`), those that `shapes` names, or unseen ones, none of `seen`."""
+    """The shapes to judge: the run's (`trained`), those that `shapes` names, or others, none of `seen`."""
     offered = {shape.id: shape for shape in source.shapes()}
     ids = check(plain(config)["shapes"], list[str] | None, "shapes")
     count = check(config.held_out, int | None, "held_out")

@@ -182,7 +182,7 @@ def _read(path: Path, key: str) -> Any:
 
 
 def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> list[str]:
-    """Names of the shapes in the order of their codes, from `split` or the experiment's own file, or numbers."""
+    """Names of the shapes in the order of their codes, from `split` or the experiment's file, or numbers."""
     above = [Path(), folder.resolve(), *folder.resolve().parents]
     places = [Path(split)] if split else [at / specs.TrainSplit for at in above if specs.TrainSplit]
     file = next((place for place in places if split or place.is_file()), None)

@@ -74,7 +74,7 @@ class Parts:
 
 
 def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Trains what a config describes into a folder; returns what `metrics.json` holds, in the first process."""
+    """Trains what a config describes into a folder; returns what `metrics.json` holds (first process)."""
     parts, written = make_parts(config, folder), plain(config)
     data, trainer = parts.data, parts.trainer
     refuse_processes_in_multirun(trainer)
