@@ -17,11 +17,12 @@ import pandas as pd
 import pytest
 import trimesh
 import yaml
+from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import is_locked, locked
+from sdfhub.locks import locked
 from sdfhub.report.pictures import ShownMesh, contact_sheet_of, loss_chart, packed, reconstruction
 from sdfhub.report.results import PLAN, ShapeScore, enter_cells, read_plan, read_sweep
 from sdfhub.report.rows import group_cells, shapes_csv, table_csv
@@ -382,9 +383,9 @@ def test_augmented_copies_are_drawn_from_and_not_shapes(tmp_path):
 
 def test_a_lock_is_held_once_and_freed(tmp_path):
     path = tmp_path / ".lock"
-    with locked(path):
-        assert is_locked(path)
-    assert not is_locked(path)
+    with locked(path), pytest.raises(Timeout):
+        FileLock(path, timeout=0).acquire()
+    FileLock(path, timeout=0).acquire().lock.release()
 
 
 def test_packed_meshes_unpack_to_the_same_places_within_a_step():

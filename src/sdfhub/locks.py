@@ -1,7 +1,6 @@
 """Lock files, which keep processes apart; the system releases one however its holder ends."""
 
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,14 +24,3 @@ def locked(path: Path, waiting: str = "") -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def is_locked(path: Path) -> bool:
-    """Whether another process holds the lock file now."""
-    if not path.exists() or not os.access(path, os.W_OK):
-        return False
-    try:
-        with FileLock(path, timeout=0):
-            return False
-    except Timeout:
-        return True

@@ -37,8 +37,7 @@ def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, A
     # ddp processes that SLURM or torchrun started train a cell together: the first holds the lock for all
     follows = any(os.environ.get(rank, "0") != "0" for rank in ("SLURM_PROCID", "RANK"))
     try:
-        # a report holds the lock for a moment, a training for hours
-        with nullcontext() if follows else FileLock(folder / ".lock", timeout=1):
+        with nullcontext() if follows else FileLock(folder / ".lock", timeout=0):
             enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
             return go_on(train, config, folder)
     except Timeout:

@@ -15,7 +15,7 @@ import yaml
 from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import is_locked, locked
+from sdfhub.locks import locked
 from sdfhub.settings import flat
 from sdfhub.whole_file import write_whole
 
@@ -166,13 +166,11 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
     try:
         if not folder.resolve().is_relative_to(folder.parent.resolve()):
             return Cell(plan, folder, "failed", "its folder is a link out of the sweep")
-        if is_locked(folder / ".lock"):
-            return Cell(plan, folder, "missing", "is being trained")
         if (folder / FAILURE).exists():
             return Cell(plan, folder, "failed", str(_read(folder, FAILURE).get("reason"))[:500])
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
-            return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
+            return Cell(plan, folder, "missing", "is not finished" if begun else "has not been run")
         return Cell(plan, folder, "done", scores=read_scores(folder))
     except (SdfhubError, OSError) as error:
         return Cell(plan, folder, "failed", str(error))
