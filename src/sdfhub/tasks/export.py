@@ -1,10 +1,7 @@
 """Task `export`: a space as one file, as a function for other runtimes, or as meshes."""
 
 import io
-import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -71,14 +68,14 @@ def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
     example = (torch.zeros(2, 5, 3), torch.zeros(2, decoder.code_size))
     batch, points = Dim("B", min=1), Dim("N", min=1)
     shapes = {"points": {0: batch, 1: points}, "codes": {0: batch}}
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):
         return torch.export.export(decoder, example, dynamic_shapes=shapes)
 
 
 def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
     """A function as the content of a file."""
     content = io.BytesIO()
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):
         if kind == "torch_export":
             torch.export.save(function, content)
             return content.getvalue()
@@ -96,14 +93,3 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
             for same in [other for other in axes if other.dim_param == axis]:
                 same.dim_param = name
         return model.SerializeToString()
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without what PyTorch says to its own developers."""
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    finally:
-        logging.disable(logging.NOTSET)

@@ -183,9 +183,9 @@ def _read(path: Path, key: str) -> Any:
 
 def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> list[str]:
     """Names of the shapes in the order of their codes, from `split` or the experiment's file, or numbers."""
-    above = [Path(), folder.resolve(), *folder.resolve().parents]
-    places = [Path(split)] if split else [at / specs.TrainSplit for at in above if specs.TrainSplit]
-    file = next((place for place in places if split or place.is_file()), None)
+    above = [Path(), folder.resolve(), *folder.resolve().parents]  # what TrainSplit may be relative to
+    places = [at / specs.TrainSplit for at in above if specs.TrainSplit]
+    file = Path(split) if split else next((place for place in places if place.is_file()), None)
     if file is None:
         log.warning(
             "%s: TrainSplit %s is not here: shapes are numbered; or give split=", folder, specs.TrainSplit

@@ -144,12 +144,6 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
     together = 1 if reconstructor.space.device.type == "cpu" else together
     made = reconstructor.reconstruct(scans, limits, out, together)
     results += tqdm(made, total=len(scans), desc="fitting", unit="scan", leave=False, disable=None)
-    report(results, out)
-    return results
-
-
-def report(results: Sequence[Result], out: Path) -> None:
-    """Prints the table; says and writes down why scans failed."""
     failed = [result for result in results if result.verdict == "failed"]
     if len(failed) < len(results):
         print(f"{table(results)}\n\nmeshes and codes: {out}")
@@ -158,6 +152,7 @@ def report(results: Sequence[Result], out: Path) -> None:
         if len(failed) < len(results) and not (out / f"{result.name}.json").exists():
             result.write(out)
         print(f"sdfhub: error: {result.reason}", file=sys.stderr)
+    return results
 
 
 def reconstruct(config: DictConfig) -> None:
