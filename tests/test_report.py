@@ -462,7 +462,7 @@ def test_truth_is_looked_up_where_the_cell_was_trained(tmp_path):
     """Two sources may give two shapes one id."""
     folders = [write_cell(tmp_path, planned(method), [0.1e-3]) for method in ("SIREN", "FFT/SIREN")]
     asked = []
-    contact_sheet_of(only_group(tmp_path), 1, 1000, lambda cell, id: asked.append((cell.folder, id)))
+    contact_sheet_of(only_group(tmp_path), 1, lambda cell, id: asked.append((cell.folder, id)))
     assert {folder for folder, _ in asked} == set(folders)
 
 

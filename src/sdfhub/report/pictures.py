@@ -24,8 +24,7 @@ from sdfhub.shapes import Frame
 PIXELS, PAPER = 208, 0.955
 """Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
 
-FEWEST, MOST = 400, 4000  # triangles of a mesh to turn
-TO_TURN = 4  # shapes to turn for each group, at most
+TRIANGLES = 1500  # of a mesh to turn, some 12 bytes each
 FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
@@ -68,40 +67,31 @@ class Sheet(NamedTuple):
         return shapes
 
 
-def contact_sheet_of(group: Group, count: int, room: int, find_truth: FindTruth) -> Sheet:
-    """Truth, then each row's first finished cell, for `count` shapes; meshes to turn take `room` bytes."""
-    shapes, to_turn = chosen(group, count), chosen(group, min(count, TO_TURN))
-    triangles = room // max(1, len(to_turn) * (len(group.rows) + 1) * 12)  # some 12 bytes each, as base64
-    triangles = min(MOST, max(FEWEST, triangles))
-
-    def tile(shape: tuple[str, str], text: str, mesh: ShownMesh | None) -> Tile:
-        if mesh is None:
-            return Tile(text)
-        image = render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
-        return Tile(text, image, packed(mesh, triangles) if shape in to_turn else None)
-
-    rows = [
-        (row.label, [tile(shape, *_shown(row, *shape, find_truth)) for shape in shapes]) for row in group.rows
-    ]
+def contact_sheet_of(group: Group, count: int, find_truth: FindTruth) -> Sheet:
+    """Truth, then each row's first finished cell, for `count` shapes: the paper's figures 2 to 6."""
+    shapes = chosen(group, count)
+    rows = [(row.label, [_shown(row, *shape, find_truth) for shape in shapes]) for row in group.rows]
     truths = [find_truth(group.first, id) for _, id in shapes] if group.first else []
-    true = [ShownMesh(t.mesh.vertices, t.mesh.faces, t.up) if t and t.mesh else None for t in truths]
-    if any(true):
-        tiles = [
-            tile(shape, "" if mesh else "no truth", mesh) for shape, mesh in zip(shapes, true, strict=True)
-        ]
-        rows.insert(0, ("Ground truth", tiles))
+    meshes = [ShownMesh(m.vertices, m.faces, t.up) if t and (m := t.mesh) else None for t in truths]
+    if any(meshes):
+        rows.insert(0, ("Ground truth", [_tile("", mesh) if mesh else Tile("no truth") for mesh in meshes]))
     return Sheet(shapes, rows)
 
 
-def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> tuple[str, ShownMesh | None]:
-    """What a row has of a shape: a text, and the mesh that it stands below."""
+def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> Tile:
+    """What a row has of a shape."""
     if row.first is None:
-        return row.state, None
+        return Tile(row.state)
     score = _scores(row.first, role).get(id)
     if score is None or score.failed:
-        return "no surface" if score else "not judged", None
+        return Tile("no surface" if score else "not judged")
     mesh = reconstruction(row.first.folder, role, score, find_truth(row.first, id))
-    return f"CD {score.counted_cd * TABLE_UNIT:.3f}" if mesh else "no mesh", mesh
+    return _tile(f"CD {score.counted_cd * TABLE_UNIT:.3f}", mesh) if mesh else Tile("no mesh")
+
+
+def _tile(text: str, mesh: ShownMesh) -> Tile:
+    image = render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
+    return Tile(text, image, packed(mesh, TRIANGLES))
 
 
 def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:

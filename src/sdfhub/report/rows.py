@@ -20,7 +20,8 @@ JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
 """Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
 
 MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
-PLACES = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
+NAMES = ["method", "normals", "detail", "label"]
+PLACES = [*JUDGING_GROUPS, "settings", *NAMES, "cell", "seed", "role", "shape"]
 SCORED = ["cd", "floor", "cd_penalty", "failed", "normal_consistency", "sdf_error", "sign_accuracy"]
 COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 
@@ -43,12 +44,7 @@ class Row:
         self.first = self.done[0] if self.done else None
         # what stands for a row without finished cells, and what search its settings come from
         self.state = "failed" if any(cell.state == "failed" for cell in self.cells) else "missing"
-        self.names = {
-            "method": self.method,
-            "normals": self.normals,
-            "detail": self.detail,
-            "label": self.label,
-        }
+        self.names = {name: getattr(self, name) for name in NAMES}
         self.searched = str(self.done[0].scores.config.get("searched") or "no")[:200] if self.done else NONE
 
 
@@ -63,6 +59,8 @@ class Group:
         done = [cell for row in self.rows for cell in row.done]
         self.first = done[0] if done else None
         self.settings = [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
+        self.place = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}  # columns of a CSV file
+        self.place["settings"] = ";".join(self.settings)
         counts = sorted({cell.scores.trained_on for cell in done})
         ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
@@ -73,7 +71,7 @@ class Group:
     def shapes(self) -> pd.DataFrame:
         """MEASURES of each judged shape, distances times 10^3; `cd` is that of a point where nothing is."""
         records = [
-            row.names | {"cell": cell.plan.folder, "seed": cell.plan.seed}
+            self.place | row.names | {"cell": cell.plan.folder, "seed": cell.plan.seed}
             | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
@@ -187,7 +185,7 @@ def table_csv(groups: list[Group]) -> str:
     frames = [pd.DataFrame({"label": []})]
     for group in groups:
         rows = [
-            _place(group) | row.names | {"cells": len(row.cells), "searched": row.searched, "role": role}
+            group.place | row.names | {"cells": len(row.cells), "searched": row.searched, "role": role}
             for row in group.rows
             for role in ROLES
         ]
@@ -198,14 +196,6 @@ def table_csv(groups: list[Group]) -> str:
 
 def shapes_csv(groups: list[Group]) -> str:
     """Every judged shape of every cell as numbers, distances times 10^3; no `cd` without a surface."""
-    frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
-    frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
+    frame = pd.concat([group.shapes for group in groups or [Group({}, [])]])
     frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)
     return frame.to_csv(index=False, float_format="%.9g")
-
-
-def _place(group: Group) -> dict[str, str]:
-    """What tells a group from others, by column of a CSV file."""
-    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {
-        "settings": ";".join(group.settings)
-    }

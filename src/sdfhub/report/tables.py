@@ -20,8 +20,6 @@ DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_medi
 DISTANCES |= {"signs right": "sign_accuracy_mean"}
 """Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
 
-LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
-
 ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
     "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
@@ -105,7 +103,7 @@ def _scores(group: Group, role: str, title: str, quantities: dict[str, str], abo
     best = {
         (int(row), column)
         for column, quantity in enumerate(quantities.values(), start=1)
-        if len(lines) > 1 and quantity in LOWER_IS_BETTER
+        if len(lines) > 1 and quantity.startswith(("cd", "excess"))
         for row in rivals.index[rivals[quantity] == rivals[quantity].min()]
     }
     return Table(TITLES[role] + title, _frame(group, columns), about, best)

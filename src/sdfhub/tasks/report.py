@@ -24,8 +24,6 @@ from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, t
 from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
 from sdfhub.whole_file import refuse_unwritable, write_whole
 
-MESH_BYTES = 4_000_000  # room for the meshes to turn on a page
-
 
 def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     """Writes tables, sheets of so many shapes and `report.html`; prints the tables."""
@@ -34,7 +32,7 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     before, after = overview(groups), [origin(read_plan(sweep).commands, cells)]
     parts: list[dict[str, Any]] = []
     for group in groups:
-        sheet = contact_sheet_of(group, shapes, MESH_BYTES // len(groups), find_truth)
+        sheet = contact_sheet_of(group, shapes, find_truth)
         write_sheet(sheet, out / f"{sheet_name(group)}.png")
         part = {"title": ", ".join(group.title), "tables": tables(group), "sheet": sheet}
         parts.append(part | {"chart": loss_chart(group)})
