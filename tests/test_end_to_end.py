@@ -26,7 +26,7 @@ from sdfhub.opening import data_of
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate
-from tests.tiny import build_autodecoder, composed, read_weights, run_command
+from tests.tiny import STORE, build_autodecoder, composed, read_weights, run_command
 
 ROOT = Path(__file__).parents[1]
 OPEN = ROOT / "data" / "open"
@@ -81,7 +81,7 @@ def trained(tmp_path_factory) -> tuple[Path, str]:
         "callbacks.slices.times=2",
         "trainer.check_val_every_n_epoch=3",
         "logger=many",
-        f"data.store={root / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={root / 'outputs'}",
     )
     return only_run(root / "outputs"), done.stdout
@@ -179,7 +179,7 @@ def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shape
         "evaluate.points=2000",
         "fit.steps=10",
         "held_out=2",
-        "data.store=" + str(folder.parents[2] / "store"),
+        f"data.store={STORE}",
     )
     assert "held-out shapes" in done.stdout
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
@@ -250,7 +250,7 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path, monkeypatch, c
         "decoder.dropout=0.1",
         "data.loader.passes_per_epoch=4",
         "data.loader.shapes_per_step=2",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         "callbacks=quiet",
         "evaluate.train=0",
         "optim=step",
@@ -294,7 +294,7 @@ def test_two_processes_train_like_one_with_the_same_batch(tmp_path, monkeypatch)
         "data.held_out=0",
         "data.loader.passes_per_epoch=10",
         "codes.max_norm=0.9",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         "callbacks=none",
         "evaluate.train=0",
         "trainer.max_epochs=1",
@@ -381,7 +381,7 @@ def test_a_full_memory_of_the_gpu_is_one_line(tmp_path, monkeypatch):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
 
     monkeypatch.setattr(L.pytorch.Trainer, "fit", full)
-    shapes = ["data.shapes=1", "data.held_out=0", f"data.store={tmp_path / 'store'}", "callbacks=none"]
+    shapes = ["data.shapes=1", "data.held_out=0", f"data.store={STORE}", "callbacks=none"]
     with pytest.raises(SdfhubError, match=r"lower computing\.points_at_once"):
         task.train_into(composed(*TINY, *shapes), tmp_path / "run")
 
@@ -395,7 +395,7 @@ def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path, monkeypatch, c
         "optim.lr_decoder=1e30",
         "activation=relu",
         "callbacks=none",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
     )
     printed = capsys.readouterr().err
@@ -421,7 +421,7 @@ def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_pa
         "data.shapes=4",
         "data.held_out=0",
         "data.preparation.samples=2000",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         task="prepare",
     )
     printed = capsys.readouterr().out
@@ -449,7 +449,7 @@ def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tm
         "trainer.check_val_every_n_epoch=5",
         "callbacks.mesh.resolution=24",
         "callbacks.slices.times=1",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
     ]
     assert run_command(monkeypatch, *common) == 2
@@ -472,7 +472,7 @@ def test_real_furniture_trains_to_a_table(tmp_path, monkeypatch):
         "data.held_out=1",
         "trainer.max_epochs=6",
         "callbacks=none",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
     )
     assert status == 0
