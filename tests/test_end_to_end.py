@@ -169,19 +169,14 @@ def test_validation_is_logged(trained):
         assert values and np.isfinite(values).all(), key
 
 
-def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(trained):
+def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(
+    trained, monkeypatch, capsys
+):
     folder, _ = trained
-    done = run(
-        ["-m", "sdfhub", "evaluate"],
-        f"run={folder}",
-        "evaluate=fast",
-        "evaluate.resolution=40",
-        "evaluate.points=2000",
-        "fit.steps=10",
-        "held_out=2",
-        f"data.store={STORE}",
-    )
-    assert "held-out shapes" in done.stdout
+    words = ["evaluate=fast", "evaluate.resolution=40", "evaluate.points=2000", "evaluate.pictures=1"]
+    words += ["fit.steps=10", "fit.samples=500", "held_out=2", f"data.store={STORE}"]
+    assert run_command(monkeypatch, str(folder), *words, task="evaluate") == 0
+    assert "held-out shapes" in capsys.readouterr().out
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["evaluation"]["resolution"] == 40
     assert len(metrics["held_out"]["shapes"]) == 2
