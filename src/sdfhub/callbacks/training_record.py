@@ -41,7 +41,8 @@ class TrainingRecord(L.Callback):
         """Counts seconds again, if the first step has been."""
         self._started = time.perf_counter() if self.stepped else None
 
-    on_validation_start, on_validation_end, on_train_end = stop_clock, start_clock, stop_clock
+    on_validation_start = on_train_end = stop_clock  # type: ignore[assignment]
+    on_validation_end = start_clock  # type: ignore[assignment]
 
     def _so_far(self) -> float:
         return self._seconds + (time.perf_counter() - self._started if self._started else 0.0)

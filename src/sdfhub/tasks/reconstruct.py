@@ -125,10 +125,10 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
     together = check(settings["together"], Annotated[int, Field(ge=1)], "together")
     files = scan_files(check(settings["scans"], str | list[str], "scans"))
     for name, path in files.items():
-        result = out / f"{name}.ply"
-        if result.resolve() == path.resolve() or (result.exists() and not is_result(result)):
+        mesh = out / f"{name}.ply"
+        if mesh.resolve() == path.resolve() or (mesh.exists() and not is_result(mesh)):
             raise SdfhubError(
-                f"out={out}: the result of {path} would overwrite {result}; choose another folder"
+                f"out={out}: the result of {path} would overwrite {mesh}; choose another folder"
             )
     reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
