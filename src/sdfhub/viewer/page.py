@@ -79,7 +79,8 @@ class Viewer:
         points = self.scans.get(self.a.value)
         with self.server.atomic():
             self.scan.visible = points is not None
-            self.scan.points = np.zeros((1, 3)) if points is None else points
+            if points is not None:
+                self.scan.points = points
         self.refresh()
 
     def fit(self, name: str, content: bytes) -> None:
