@@ -44,12 +44,7 @@ TRIED_AGAIN = ("error", "crash")  # reasons that lie in the machine or the progr
 
 
 class Store(dict[str, StoredShape]):
-    """Prepared shapes of one source under one preparation by id, in the order asked for.
-
-    Args:
-        folder: of the store.
-        shapes: those wanted of it; the rejected ones are listed in `rejected` alone.
-    """
+    """The usable ones of the `shapes` asked for by id, in their order; the others are in `rejected` alone."""
 
     def __init__(self, folder: Path, shapes: Iterable[StoredShape]):
         shapes = list(shapes)
@@ -102,17 +97,12 @@ def prepare(
         SdfhubError: not one shape could be prepared, or the store cannot be written.
     """
     folder = root / source.name / preparation_hash(preparation)
-    stored = _checked(folder, shapes, source, preparation, quiet=True)
+    stored = _checked(folder, shapes, source, preparation, logging.DEBUG)
     if _left(shapes, stored):
         waiting = f"store: {folder}: waiting for another process that prepares it"
         with _writing(folder), locked(folder / ".lock", waiting=waiting):
             _remove_leftovers(folder)
-            # another process may have filled it meanwhile
-            left = _left(shapes, _checked(folder, shapes, source, preparation))
-            for shape, is_crash in _prepared(source, left, preparation, folder, workers):
-                if is_crash:
-                    what = "the worker process died: out of memory, or a fault in a native library"
-                    write_shape(_file(folder, shape.id), {}, _record(shape, "crash", what))
+            prepare_part(source, shapes, preparation, root, workers)
         stored = _checked(folder, shapes, source, preparation)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
@@ -124,15 +114,22 @@ def prepare(
 def prepare_part(
     source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> int:
-    """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
+    """Prepares those of `shapes` that the store lacks, and returns their number.
 
-    Returns:
-        How many were prepared or rejected; those whose worker died are left to the next call.
+    Several machines may prepare parts of a store side by side. Arguments are those of `prepare`.
     """
     folder = root / source.name / preparation_hash(preparation)
     with _writing(folder):
         left = _left(shapes, _checked(folder, shapes, source, preparation))
-        return sum(not is_crash for _, is_crash in _prepared(source, left, preparation, folder, workers))
+        workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
+        results = map_in_processes(partial(prepare_shape, source, preparation, folder), left, workers)
+        # disable=None: no bar where nobody watches
+        bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
+        for index, result in bar:
+            if isinstance(result, Crashed):
+                what = "the worker process died: out of memory, or a fault in a native library"
+                write_shape(_file(folder, left[index].id), {}, _record(left[index], "crash", what))
+    return len(left)
 
 
 def preparation_hash(preparation: Preparation) -> str:
@@ -157,9 +154,7 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
         arrays = arrays_of(samples, seed)
         x, y, z = samples.center.tolist()
         statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = replace(
-            _record(shape, None), center=(x, y, z), scale=float(samples.scale), statistics=statistics
-        )
+        record = replace(_record(shape), center=(x, y, z), scale=float(samples.scale), statistics=statistics)
     except RejectedMesh as rejection:
         record = _record(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
@@ -168,21 +163,9 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
     write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
-def _record(shape: Shape, reason: str | None, detail: str = "") -> Record:
+def _record(shape: Shape, reason: str | None = None, detail: str = "") -> Record:
     detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
     return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
-
-
-def _prepared(
-    source: Source, left: list[Shape], preparation: Preparation, folder: Path, workers: int | None
-) -> Iterator[tuple[Shape, bool]]:
-    """Each shape when it is prepared, and whether its worker died on it."""
-    workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
-    function = partial(prepare_shape, source, preparation, folder)
-    results = map_in_processes(function, left, workers) if workers > 1 else enumerate(map(function, left))
-    # disable=None: no bar where nobody watches
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
-    return ((left[index], isinstance(result, Crashed)) for index, result in bar)
 
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
@@ -214,18 +197,17 @@ def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -
 
 
 def _checked(
-    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, quiet: bool = False
+    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, level: int = logging.WARNING
 ) -> dict[str, StoredShape]:
     """The stored shapes whose files are intact, by id; damage is logged.
 
     The index notes which files are intact, and for a reader what the store was made of.
     """
-    level = logging.DEBUG if quiet else logging.WARNING
     stored = _read(folder, [shape.id for shape in shapes], source.up, level)
     try:
         known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]
         changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except Exception:  # it is not there, or holds anything
         known, changed = {}, dict(stored)
     with ThreadPoolExecutor() as pool:  # hashing lets other threads run
         intact = dict(zip(changed, pool.map(StoredShape.is_intact, changed.values()), strict=True))

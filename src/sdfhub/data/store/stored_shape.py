@@ -7,14 +7,16 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import field
 from io import BufferedReader
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict, PositiveFloat, TypeAdapter
+from pydantic import ConfigDict, PositiveFloat
+from pydantic.dataclasses import dataclass
 
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame, InFrame, NormalizedMesh, ShapeSamples
@@ -30,11 +32,9 @@ _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(allow_inf_nan=False))
 class Record:
     """What is known of a prepared or rejected shape."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
     fingerprint: str  # this and the next two as the source gave them
     category: str
@@ -46,9 +46,6 @@ class Record:
     reason: str | None = None  # why the shape was rejected; None where it was not
     detail: str = ""  # of the rejection
     sha256: str = ""  # of all else in the file
-
-
-_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
 
 
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
@@ -71,8 +68,7 @@ def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) ->
     for array in arrays.values():
         digest.update(array.data)
     record = dataclasses.replace(record, sha256=digest.hexdigest())
-    metadata = {"__metadata__": {"record": json.dumps(dataclasses.asdict(record))}}
-    text = json.dumps(metadata | header).encode()
+    text = json.dumps({"__metadata__": {"record": json.dumps(dataclasses.asdict(record))}} | header).encode()
     text += b" " * (-len(text) % 8)
     with whole_file(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
@@ -118,25 +114,21 @@ class StoredShape(InFrame):
 
     def __init__(self, id: str, path: Path, up: Literal["y", "z"] = "z"):
         self.id, self.path, self.up = id, path, up
-        with self._open() as file:
+        with open(path, "rb", opener=_without_links) as file:
             status = os.fstat(file.fileno())
             length = int.from_bytes(file.read(8), "little")
-            if length > min(status.st_size, _MAX_HEADER):
-                raise ValueError("its header is damaged")
-            text = file.read(length)
+            text = file.read(length) if length <= _MAX_HEADER else b""
         try:
             header = json.loads(text)
-            self.record = _RECORD.validate_json(header.pop("__metadata__")["record"])
-            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in header.items()}
-            is_ours = header == _header(self._rows)
-            is_ours &= all(type(rows) is int and rows >= 0 for rows in self._rows.values())
-        except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
+            self.record = Record(**json.loads(header.pop("__metadata__")["record"]))
+            rows = {name: entry["shape"][0] for name, entry in header.items()}
+            self._header = _header(rows)
+            if header != self._header or not all(type(n) is int and n >= 0 for n in rows.values()):
+                raise ValueError("not the arrays of a shape")
+        except Exception as error:  # it may hold anything
             raise ValueError(f"its header is damaged: {error!r}") from error
-        if not is_ours:
-            raise ValueError("its header is damaged")
         self.state, self._size = f"{status.st_size} {status.st_mtime_ns}", status.st_size
         self._start = 8 + length
-        self._offsets = {name: self._start + entry["data_offsets"][0] for name, entry in header.items()}
         size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
         if size != self._size:
             raise ValueError(f"it has {self._size} bytes, not {size}")
@@ -162,14 +154,14 @@ class StoredShape(InFrame):
     @property
     def mesh(self) -> NormalizedMesh | None:
         """The oriented mesh behind the samples, read into memory; None where the source has none."""
-        if "faces" not in self._rows:
+        if "faces" not in self._header:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
         return NormalizedMesh(vertices, faces, self.frame)
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
-        return self._rows.get(name, 0)
+        return self._header[name]["shape"][0] if name in self._header else 0
 
     def read(self, name: str, start: int, count: int) -> np.ndarray:
         """`count` rows [count, C] of an array from row `start` on; after the last comes the first."""
@@ -182,48 +174,44 @@ class StoredShape(InFrame):
         if not len(rows):
             return
         start %= self.rows(name)
-        try:
-            with self._open() as file:
-                self._refuse_other_size(file)
-                while len(rows):
-                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
-                    file.seek(self._offsets[name] + start * part.strides[0])
-                    file.readinto(part.data.cast("B"))
-                    start = 0
-        except (OSError, ValueError) as error:
-            raise self._broken(error) from error
+        with self._opened() as file:
+            while len(rows):
+                part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                file.seek(self._offset(name) + start * part.strides[0])
+                file.readinto(part.data.cast("B"))
+                start = 0
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
         try:
-            with self._open() as file:
+            with self._opened() as file:
                 file.seek(self._start)
-                digest = hashlib.file_digest(file, lambda: _digest(self.record, _header(self._rows)))
+                digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
             return digest.hexdigest() == self.record.sha256
-        except OSError:
+        except SdfhubError:
             return False
 
-    def _open(self) -> BufferedReader:
-        return open(self.path, "rb", opener=_without_links)
+    def _offset(self, name: str) -> int:
+        return self._start + self._header[name]["data_offsets"][0]
 
     def _map(self, name: str) -> np.ndarray:
         shape = (self.rows(name), COLUMNS[name])
         if not shape[0]:  # an empty file cannot be mapped
             return np.zeros(shape, dtype=DTYPES[name])
+        with self._opened() as file:
+            return np.memmap(file, DTYPES[name], "r", self._offset(name), shape)
+
+    @contextmanager
+    def _opened(self) -> Iterator[BufferedReader]:
         try:
-            with self._open() as file:
-                self._refuse_other_size(file)
-                return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
+            with open(self.path, "rb", opener=_without_links) as file:
+                if (size := os.fstat(file.fileno()).st_size) != self._size:
+                    raise ValueError(f"it has {size} bytes, not {self._size}")
+                yield file
         except (OSError, ValueError) as error:
-            raise self._broken(error) from error
-
-    def _refuse_other_size(self, file: BufferedReader) -> None:
-        if (size := os.fstat(file.fileno()).st_size) != self._size:
-            raise ValueError(f"it has {size} bytes, not {self._size}")
-
-    def _broken(self, error: Exception) -> SdfhubError:
-        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-        return SdfhubError(f"{self.path}: {why}; start or prepare again: damaged shapes are prepared anew")
+            why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
+            again = "start or prepare again: damaged shapes are prepared anew"
+            raise SdfhubError(f"{self.path}: {why}; {again}") from error
 
 
 def _without_links(path: str, flags: int) -> int:
