@@ -83,31 +83,25 @@ def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
 
 
 def read_samples(path: Path) -> ShapeSamples:
-    """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does.
-
-    Raises:
-        RejectedMesh: corrupt_file; one_sided_samples where nothing lies outside or nothing inside;
-            wrong_frame where points lie beyond REACH.
-    """
+    """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does."""
     parts = []
     for name in ("pos", "neg"):
         rows = npz_array(path, name)
         if rows.ndim != 2 or rows.shape[1] != 4:
-            what = f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]"
-            raise RejectedMesh("corrupt_file", what)
+            raise RejectedMesh("corrupt_file", f"{path}: {name} is {list(rows.shape)}, not [n, 4]")
         rows = rows.astype(np.float32)
         parts.append(rows[np.isfinite(rows).all(axis=1)])
-    outside, inside = parts
-    if not len(outside) or not len(inside):
-        what = f"{path}: {len(outside)} samples outside, {len(inside)} inside"
-        raise RejectedMesh("one_sided_samples", what)
-    rows = np.concatenate([outside, inside])
+    outside, inside = map(len, parts)
+    if not outside or not inside:
+        raise RejectedMesh("one_sided_samples", f"{path}: {outside} samples outside, {inside} inside")
+    rows = np.concatenate(parts)
     if (reach := np.abs(rows[:, :3]).max()) > REACH:
         what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
         raise RejectedMesh("wrong_frame", what)
-    none = np.zeros((0, 3), dtype=np.float32)
-    frame, statistics = frame_of(path) or NORMALIZED, {"inside": len(inside) / len(rows)}
-    return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, statistics)
+    none, frame = np.zeros((0, 3), dtype=np.float32), frame_of(path) or NORMALIZED
+    return ShapeSamples(
+        rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, {"inside": inside / len(rows)}
+    )
 
 
 def frame_of(path: Path) -> Frame | None:
@@ -133,19 +127,15 @@ def npz_array(path: Path, name: str) -> np.ndarray:
     """One floating-point array of an .npz, its size checked before anything is allocated."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
-            if np.lib.format.read_magic(file) != (
-                1,
-                0,
-            ):  # headers of others may claim gigabytes for themselves
+            if np.lib.format.read_magic(file) != (1, 0):  # other headers may claim gigabytes for themselves
                 raise ValueError(f"{name} is not in numpy's format 1.0")
             shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
             size = math.prod(shape) * dtype.itemsize
             if dtype.kind != "f" or min(shape, default=0) < 0 or size > MAX_BYTES:
                 raise ValueError(f"{name} is {list(shape)} {dtype}, not some floating-point numbers")
-            content = file.read(size)
+            array = np.frombuffer(file.read(size), dtype, math.prod(shape))
             if file.read(1):  # at its end the archive's checksum is compared
                 raise ValueError(f"{name} is longer than its header says")
-            array = np.frombuffer(content, dtype, math.prod(shape))
             return array.reshape(shape, order="F" if is_fortran else "C")
     except (MemoryError, RecursionError):
         raise

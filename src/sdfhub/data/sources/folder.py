@@ -3,16 +3,16 @@
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path, read_mesh
+from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path
 from sdfhub.data.sources.source import Shape, folder_safe, unique_ids
 from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Mesh
 from sdfhub.whole_file import file_sha256
 
 
@@ -48,13 +48,13 @@ class FolderSource(SourceOfFiles):
         return folder_safe(self.root.resolve().name)
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
-        below = {path: path.relative_to(self.root) for path in sorted(self.root.rglob("*"))}
+        below = {path: path.relative_to(self.root) for path in self.root.rglob("*")}
         ids = {
             path: _id(part)
             for path, part in below.items()
-            if part.suffix.lower() in FORMATS
-            and not any(name.startswith(".") for name in part.parts)
+            if path.suffix.lower() in FORMATS
             and path.is_file()
+            and not re.search(r"(^|/)\.", part.as_posix())
         }
         if not ids:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")
@@ -64,14 +64,11 @@ class FolderSource(SourceOfFiles):
             raise SdfhubError(f"category={missing[0]}: {what}; without category= all are taken")
         for id, file in sorted(unique_ids(ids, self.root).items()):
             category = id.partition("/")[0]
-            if not self.categories or category in self.categories:
+            if category in (self.categories or there):
                 # a name may hold bytes of another encoding, which JSON would not take
                 title = os.fsencode(file.name).decode(errors="replace")
                 shape = Shape(id, category, _fingerprint(file), credits={"title": title})
                 yield shape, file, below[file].with_suffix("").as_posix()
-
-    def read(self, file: Path) -> Mesh:
-        return read_mesh(file)
 
 
 def _id(path: Path) -> str:
@@ -83,9 +80,7 @@ def _fingerprint(file: Path) -> str:
     """Hash of a file's content, and of the buffers that a .gltf names."""
     digest = file_sha256(file)
     if file.suffix.lower() == ".gltf":
-        with suppress(
-            ValueError, AttributeError, TypeError, RecursionError
-        ):  # reading will say what is wrong
+        with suppress(ValueError, AttributeError, TypeError, RecursionError):  # reading says what is wrong
             buffers = [buffer_path(file.parent, name) for name in buffer_names(json.loads(file.read_bytes()))]
             parts = [digest, *(file_sha256(buffer) for buffer in buffers if buffer)]
             digest = hashlib.sha256("".join(parts).encode()).hexdigest()

@@ -6,11 +6,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, StringConstraints
 
-from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.sources.source import Shape, checked_categories, folder_safe
 from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Mesh
 
 LAYOUTS = ("models/model_normalized.obj", "model.obj")  # of a model's mesh: version 2, version 1
 
@@ -56,6 +54,3 @@ class ShapeNetSource(SourceOfFiles):
                 id, state = f"{category}/{folder_safe(model)}", file.stat()
                 shape = Shape(id, category, f"{state.st_size} {state.st_mtime_ns}", credits=credits)
                 yield shape, file, f"{synset}/{model}"
-
-    def read(self, file: Path) -> Mesh:
-        return read_mesh(file)

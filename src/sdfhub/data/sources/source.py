@@ -81,11 +81,10 @@ def folder_safe(text: str) -> str:
 
 def unique_ids(wanted: Mapping[Path, str], root: Path | None = None) -> dict[str, Path]:
     """Path of each id; paths that want the same id get some digits of their hash, below `root`, behind it."""
-    uses = Counter(wanted.values())
-    below = {path: path.relative_to(root) if root else path for path in wanted}
-    return {
-        id if uses[id] == 1 else f"{id}-{digits(below[path])}": path for path, id in sorted(wanted.items())
-    }
+    uses, unique = Counter(wanted.values()), {}
+    for path, id in sorted(wanted.items()):
+        unique[id if uses[id] == 1 else f"{id}-{digits(path.relative_to(root or ''))}"] = path
+    return unique
 
 
 def digits(path: Path) -> str:

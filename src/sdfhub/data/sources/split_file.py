@@ -4,10 +4,13 @@ import json
 import logging
 import os
 from abc import abstractmethod
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
+from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.sources.source import Role, Shape, Source, digits, folder_safe
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples
@@ -20,7 +23,7 @@ class SourceOfFiles(Source):
 
     Args:
         kind: beginning of its name.
-        root: the folder that holds the files.
+        root: the folder that holds the files, searched with all below it.
         train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
             either is given, unlisted shapes are left out. None lets a seed decide.
     """
@@ -37,9 +40,9 @@ class SourceOfFiles(Source):
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         """Each shape by id with its file, and its path below the root as split files have it."""
 
-    @abstractmethod
     def read(self, file: Path) -> Mesh | ShapeSamples:
         """What a shape's file holds."""
+        return read_mesh(file)
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
@@ -63,35 +66,33 @@ def with_roles(
     A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
     of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
     name is the path of a file below the root, as beside each shape, or its last parts, without suffix.
-
-    Raises:
-        SdfhubError: a file is missing or of another form, lists nothing that is there, or both list a shape.
     """
     if not train_split and not test_split:
         return [shape for shape, _ in shapes]
     role_of: dict[str, Role] = {}
     files: dict[Role, str | None] = {"train": train_split, "held_out": test_split}
     for role, file in files.items():
-        listed = _ids_listed(shapes, file, role) if file else []
-        if both := next((id for id in listed if id in role_of), None):
-            raise SdfhubError(f"{file}: {both} is in the training split as well")
+        listed = _ids_listed(shapes, file, role) if file else set()
+        if both := sorted(listed & role_of.keys()):
+            raise SdfhubError(f"{file}: {both[0]} is in the training split as well")
         role_of |= dict.fromkeys(listed, role)
     return [replace(shape, split=role_of[shape.id]) for shape, _ in shapes if shape.id in role_of]
 
 
-def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: Role) -> list[str]:
-    names, paths = set(names_listed(file, role)), {path for _, path in shapes}
-    vague = names - paths  # the others name one path each
-    endings = {ending for name in vague for ending in _endings(name)}
-    listed = [
-        shape.id
-        for shape, path in shapes
-        if path in names or path in endings or not vague.isdisjoint(_endings(path))
-    ]
+def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: Role) -> set[str]:
+    names, of_path, of_ending = sorted(set(names_listed(file, role))), defaultdict(list), defaultdict(list)
+    for shape, path in shapes:
+        of_path[path].append(shape.id)
+        for ending in _endings(path):
+            of_ending[ending].append(shape.id)
+    ids = {}  # a name that is a path means that file alone; others are the last parts of one, or end in one
+    for name in names:
+        longer, shorter = of_ending.get(name, []), (of_path.get(end, []) for end in _endings(name))
+        ids[name] = of_path.get(name) or [*longer, *chain.from_iterable(shorter)]
+    listed = set(chain.from_iterable(ids.values()))
     if not listed:
         raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
-    there = {ending for path in paths for ending in _endings(path)}
-    if lost := sorted(name for name in vague if name not in there and paths.isdisjoint(_endings(name))):
+    if lost := [name for name in names if not ids[name]]:
         what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
         log.warning(f"{file}: {what}, such as {lost[0]}")
     return listed

@@ -55,8 +55,7 @@ class Store(dict[str, StoredShape]):
     @classmethod
     def open(cls, folder: Path, up: Literal["y", "z"] = "z") -> "Store":
         """All shapes whose files lie in `folder`; raises SdfhubError where there are none."""
-        files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
-        paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
+        paths = (file.relative_to(folder).as_posix() for file in folder.rglob(f"*{SUFFIX}"))
         ids = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
         if not ids:
             raise SdfhubError(f"{folder}: holds no prepared shapes; run `sdfhub prepare` first")
@@ -84,17 +83,7 @@ def prepare(
 
     A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its file is
     damaged. Its randomness derives from its id and fingerprint, so neither the order nor the number of
-    workers matters.
-
-    Args:
-        source: picklable; loads the shapes.
-        shapes: what is wanted.
-        preparation: the settings, part of the store's folder name.
-        root: folder of all stores.
-        workers: processes; None takes one per core, 1 works in this process.
-
-    Raises:
-        SdfhubError: not one shape could be prepared, or the store cannot be written.
+    workers (None: one per core; 1: none but this process) matters. `root` is the folder of all stores.
     """
     folder = root / source.name / preparation_hash(preparation)
     stored = _checked(folder, shapes, source, preparation, logging.DEBUG)
@@ -224,10 +213,9 @@ def _checked(
 
 def _remove_leftovers(folder: Path) -> None:
     """Removes the half-written files of runs that were killed more than an hour ago."""
-    for path, _, names in os.walk(folder):
-        for leftover in (Path(path, name) for name in names if re.fullmatch(r"\..+\.[0-9a-f]{12}", name)):
-            if time.time() - leftover.lstat().st_mtime > 3600:
-                leftover.unlink(missing_ok=True)
+    for file in folder.rglob(".*"):
+        if re.fullmatch(r"\..+\.[0-9a-f]{12}", file.name) and time.time() - file.lstat().st_mtime > 3600:
+            file.unlink(missing_ok=True)
 
 
 @contextmanager
