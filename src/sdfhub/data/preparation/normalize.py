@@ -15,22 +15,23 @@ def normalize_mesh(
 ) -> NormalizedMesh:
     """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
 
-    Vertices are merged in the normalised frame, where a tolerance means the same for every mesh, be its scale
-    1e20 or 1e-12. Triangles with the same three corners count once, whichever way they turn.
-
-    Args:
-        vertices: [V, 3] numbers, source units.
-        faces: [F, 3] integers, rows of `vertices`.
-        preparation: `min_faces`, `min_extent_ratio`, `max_zero_area` and `max_components` are used.
-
-    Raises:
-        RejectedMesh: the arrays make no mesh, or a limit is passed.
+    Vertices [V, 3] are merged in the normalised frame, where a tolerance means the same for every mesh, be
+    its scale 1e20 or 1e-12. Triangles [F, 3] with the same three corners count once, whichever way they turn.
     """
     vertices, faces = _checked_arrays(vertices, faces)
     if len(faces) < preparation.min_faces:
         raise RejectedMesh("too_few_faces", f"{len(faces)} faces, at least {preparation.min_faces} wanted")
     used, faces = np.unique(faces, return_inverse=True)
-    frame, vertices = _normalized(vertices[used], preparation.min_extent_ratio)
+    vertices = vertices[used]
+    half = vertices.max(axis=0) / 2 - vertices.min(axis=0) / 2  # halves first: a sum may overflow
+    ratio, wanted = half.min() / max(half.max(), np.finfo(np.float64).tiny), preparation.min_extent_ratio
+    if not half.max() > 0 or ratio < wanted:
+        raise RejectedMesh("flat", f"smallest over largest extent {ratio:.2g}, at least {wanted} wanted")
+    try:
+        frame, vertices = Frame.around(vertices)
+    except ValueError as error:
+        what = f"largest extent {2 * half.max():.2g} cannot be normalised"
+        raise RejectedMesh("extent_out_of_range", what) from error
     vertices, faces = _merged(vertices, faces.reshape(-1, 3))
     filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
     if (empty := 1 - filled.mean()) > preparation.max_zero_area:
@@ -61,19 +62,6 @@ def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     if bad := int((~np.isfinite(vertices)).any(axis=1).sum()):
         raise RejectedMesh("non_finite_vertices", f"{bad} of {len(vertices)} vertices are not finite")
     return vertices, faces
-
-
-def _normalized(corners: np.ndarray, min_extent_ratio: float) -> tuple[Frame, np.ndarray]:
-    half = corners.max(axis=0) / 2 - corners.min(axis=0) / 2  # halves first: a sum may overflow
-    ratio = half.min() / half.max() if half.max() > 0 else 0.0
-    if not half.max() > 0 or ratio < min_extent_ratio:
-        detail = f"smallest over largest extent {ratio:.2g}, at least {min_extent_ratio} wanted"
-        raise RejectedMesh("flat", detail)
-    try:
-        return Frame.around(corners)
-    except ValueError as error:
-        what = f"largest extent {2 * half.max():.2g} cannot be normalised"
-        raise RejectedMesh("extent_out_of_range", what) from error
 
 
 def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

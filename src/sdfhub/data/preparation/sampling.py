@@ -52,27 +52,23 @@ def prepare_mesh(
         method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
         signed = _signed_samples(surface, method, preparation, rng)
     points, sdf, statistics = signed
-    certain, inside = statistics["certain"], statistics["inside"]
-    low, high = preparation.min_inside, preparation.max_inside
-    if certain < preparation.min_certain:
-        what = f"{certain:.1%} certain, at least {preparation.min_certain:.0%} wanted"
-        raise RejectedMesh("ambiguous_signs", what)
-    if not low <= inside <= high:
-        raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
-    surface_points, normals = np.zeros((0, 3)), np.zeros((0, 3))
+    _refuse_doubtful(statistics["certain"], statistics["inside"], preparation)
+    oriented = np.zeros((2, 0, 3))
     if count := preparation.surface_points:
-        surface_points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
-        order = rng.permutation(count)
-        surface_points, normals = surface_points[order], normals[order]
-    return ShapeSamples(
-        points.astype(np.float32),
-        sdf.astype(np.float32),
-        surface_points.astype(np.float32),
-        normals.astype(np.float32),
-        normalized.frame,
-        NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
-        statistics,
-    )
+        found = np.stack(sample_surface(surface.vertices, surface.solid(), count, rng))
+        oriented = found[:, rng.permutation(count)]
+    arrays = (array.astype(np.float32) for array in (points, sdf, *oriented))
+    sampled = NormalizedMesh(surface.vertices, surface.faces, normalized.frame)
+    return ShapeSamples(*arrays, normalized.frame, sampled, statistics)
+
+
+def _refuse_doubtful(certain: float, inside: float, limits: Preparation) -> None:
+    if certain < limits.min_certain:
+        what = f"{certain:.1%} certain, at least {limits.min_certain:.0%} wanted"
+        raise RejectedMesh("ambiguous_signs", what)
+    if not limits.min_inside <= inside <= limits.max_inside:
+        what = f"{inside:.2%} inside, {limits.min_inside:.1%} to {limits.max_inside:.0%} wanted"
+        raise RejectedMesh("inside_fraction", what)
 
 
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:

@@ -141,9 +141,11 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
         loaded = source.load(shape)
         samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
         arrays = arrays_of(samples, seed)
-        x, y, z = samples.center.tolist()
+        x, y, z = samples.frame.center.tolist()
         statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = replace(_record(shape), center=(x, y, z), scale=float(samples.scale), statistics=statistics)
+        record = replace(
+            _record(shape), center=(x, y, z), scale=float(samples.frame.scale), statistics=statistics
+        )
     except RejectedMesh as rejection:
         record = _record(shape, rejection.reason, rejection.detail)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on

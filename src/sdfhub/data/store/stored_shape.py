@@ -19,7 +19,7 @@ from pydantic import ConfigDict, PositiveFloat
 from pydantic.dataclasses import dataclass
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Frame, InFrame, NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
@@ -92,7 +92,7 @@ def _digest(record: Record, header: Mapping[str, dict]) -> "hashlib._Hash":
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode())
 
 
-class StoredShape(InFrame):
+class StoredShape:
     """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
     Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
