@@ -25,7 +25,7 @@ def check_id(id: str) -> None:
 
 
 def _check(owner: Any, **layouts: tuple) -> None:
-    """Raises ValueError where a field has other sizes (a letter stands for one) or another dtype, the last."""
+    """Raises ValueError where a field has other sizes (a letter stands for one), or another dtype (last)."""
     sizes: dict[Any, int] = {}
     for name, (*layout, dtype) in layouts.items():
         array = getattr(owner, name)

@@ -51,9 +51,9 @@ class Surface:
 def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> np.ndarray:
     """[2, F] share of each face's counter-clockwise and other side that parallel views from all around see.
 
-    An isolated face reaches about 0.5 on its outer side. Rays are aimed at points on the faces: a small one is
-    then judged by as many as it needs. A first round looks at every face, large ones more often; a second at
-    those seen too little, or from either side.
+    An isolated face reaches about 0.5 on its outer side. Rays are aimed at points on the faces: a small one
+    is then judged by as many as it needs. A first round looks at every face, large ones more often; a second
+    at those seen too little, or from either side.
     """
     directions = rng.permutation(sphere_directions(views)).astype(np.float32)
     corners, normals = mesh.vertices.astype(np.float32)[mesh.faces], face_normals(mesh.vertices, mesh.faces)

@@ -214,5 +214,32 @@ class StoredShape:
             raise SdfhubError(f"{self.path}: {why}; {again}") from error
 
 
+def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
+    rows = np.empty((count, 4), np.float32)
+    draw_signed(rows, shape, rng)
+    return rows
+
+
+def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> None:
+    """Fills rows [N, 4], contiguous, with what `signed_samples` returns."""
+    outside = len(rows) - len(rows) // 2
+    draw_rows(rows[:outside], shape, "outside", rng)
+    draw_rows(rows[outside:], shape, "inside", rng)
+
+
+def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
+    """Fills rows [n, C], contiguous, with consecutive ones of a shuffled array from a random start."""
+    refuse_empty(shape, name, len(rows))
+    if len(rows):
+        shape.read_into(rows, name, int(rng.integers(shape.rows(name))))
+
+
+def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
+    """Raises SdfhubError where rows are to be drawn of an array that has none."""
+    if count and not shape.rows(name):
+        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
+
+
 def _without_links(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))
