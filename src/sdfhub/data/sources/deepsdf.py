@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sdfhub.data.sources.folder import SourceOfFiles
 from sdfhub.data.sources.source import Shape, folder_safe, unique_ids
-from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NORMALIZED, Frame, ShapeSamples
 

@@ -48,11 +48,7 @@ class Source(ABC):
 
     @abstractmethod
     def shapes(self) -> list[Shape]:
-        """All shapes on offer, sorted by id, the same in every process.
-
-        Raises:
-            SdfhubError: the source's root is not there or holds no shape.
-        """
+        """All shapes on offer, sorted by id, the same in every process; SdfhubError where there is none."""
 
     @abstractmethod
     def load(self, shape: Shape) -> Mesh | ShapeSamples:

@@ -1,61 +1,17 @@
-"""Sources of files below a root, and split files: which of them somebody else trained and tested on."""
+"""Split files: which shapes somebody else trained and tested on."""
 
 import json
 import logging
-import os
-from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from sdfhub.data.sources.mesh_files import read_mesh
-from sdfhub.data.sources.source import Role, Shape, Source, digits, folder_safe
+from sdfhub.data.sources.source import Role, Shape
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Mesh, ShapeSamples
 
 log = logging.getLogger(__name__)
-
-
-class SourceOfFiles(Source):
-    """A source of one file per shape below a root; split files may give roles.
-
-    Args:
-        kind: beginning of its name.
-        root: the folder that holds the files, searched with all below it.
-        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
-            either is given, unlisted shapes are left out. None lets a seed decide.
-    """
-
-    def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
-        self.root = Path(os.path.abspath(root))
-        self.train_split = train_split and os.path.abspath(train_split)
-        self.test_split = test_split and os.path.abspath(test_split)
-        place = self.root.resolve()
-        self.name = f"{kind}-{folder_safe(place.name)}-{digits(place)}"
-        self._files: dict[str, Path] = {}
-
-    @abstractmethod
-    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
-        """Each shape by id with its file, and its path below the root as split files have it."""
-
-    def read(self, file: Path) -> Mesh | ShapeSamples:
-        """What a shape's file holds."""
-        return read_mesh(file)
-
-    def shapes(self) -> list[Shape]:
-        if not self.root.is_dir():
-            what = "a file, not a folder" if self.root.exists() else "no such folder"
-            raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
-        listed = list(self.listed())
-        self._files = {shape.id: file for shape, file, _ in listed}
-        return with_roles([(shape, path) for shape, _, path in listed], self.train_split, self.test_split)
-
-    def load(self, shape: Shape) -> Mesh | ShapeSamples:
-        if not self._files:
-            self.shapes()
-        return self.read(self._files[shape.id])
 
 
 def with_roles(
