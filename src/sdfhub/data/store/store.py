@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -70,10 +70,11 @@ class Store(dict[str, StoredShape]):
         seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
-        for reason, count in Counter(record.reason for record in self.rejected.values()).most_common():
-            id, detail = next((id, r.detail) for id, r in self.rejected.items() if r.reason == reason)
-            lines.append(f"  rejected {count} x {reason}, such as {id} ({detail})")
-        return "\n".join(lines)
+        such = {record.reason: f"{id} ({record.detail})" for id, record in self.rejected.items()}
+        counts = Counter(record.reason for record in self.rejected.values()).most_common()
+        return "\n".join(
+            lines + [f"  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts]
+        )
 
 
 def prepare(
@@ -103,10 +104,7 @@ def prepare(
 def prepare_part(
     source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> int:
-    """Prepares those of `shapes` that the store lacks, and returns their number.
-
-    Several machines may prepare parts of a store side by side. Arguments are those of `prepare`.
-    """
+    """Prepares those of `shapes` that the store lacks, also beside other machines; returns their number."""
     folder = root / source.name / preparation_hash(preparation)
     with _writing(folder):
         left = _left(shapes, _checked(folder, shapes, source, preparation))
@@ -117,7 +115,7 @@ def prepare_part(
         for index, result in bar:
             if isinstance(result, Crashed):
                 what = "the worker process died: out of memory, or a fault in a native library"
-                write_shape(_file(folder, left[index].id), {}, _record(left[index], "crash", what))
+                write_shape(_file(folder, left[index].id), {}, _record(left[index], what, reason="crash"))
     return len(left)
 
 
@@ -141,22 +139,19 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
         loaded = source.load(shape)
         samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
         arrays = arrays_of(samples, seed)
-        x, y, z = samples.frame.center.tolist()
-        statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = replace(
-            _record(shape), center=(x, y, z), scale=float(samples.frame.scale), statistics=statistics
-        )
+        frame, statistics = samples.frame, samples.statistics
+        record = _record(shape, center=frame.center.tolist(), scale=frame.scale, statistics=statistics)
     except RejectedMesh as rejection:
-        record = _record(shape, rejection.reason, rejection.detail)
+        record = _record(shape, rejection.detail, reason=rejection.reason)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
-        record = _record(shape, "error", f"{type(error).__name__}: {error}")
+        record = _record(shape, f"{type(error).__name__}: {error}", reason="error")
     seconds = round(time.perf_counter() - start, 4)
     write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
-def _record(shape: Shape, reason: str | None = None, detail: str = "") -> Record:
+def _record(shape: Shape, detail: str = "", **known: Any) -> Record:
     detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
-    return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
+    return Record(shape.fingerprint, shape.category, shape.credits, detail=detail, **known)
 
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
@@ -190,10 +185,7 @@ def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -
 def _checked(
     folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, level: int = logging.WARNING
 ) -> dict[str, StoredShape]:
-    """The stored shapes whose files are intact, by id; damage is logged.
-
-    The index notes which files are intact, and for a reader what the store was made of.
-    """
+    """The stored shapes whose files are intact, by id; the index notes which these are."""
     stored = _read(folder, [shape.id for shape in shapes], source.up, level)
     try:
         known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]

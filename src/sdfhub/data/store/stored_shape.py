@@ -52,9 +52,9 @@ def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
     """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
     rng, inside = np.random.default_rng(seed), samples.sdf < 0
     rows = np.column_stack([samples.points, samples.sdf])
-    arrays = {"outside": rng.permutation(rows[~inside]), "inside": rng.permutation(rows[inside])}
     surface = np.column_stack([samples.surface_points, samples.surface_normals])
-    arrays["surface"] = rng.permutation(surface)
+    arrays = {"outside": rows[~inside], "inside": rows[inside], "surface": surface}
+    arrays = {name: rng.permutation(array) for name, array in arrays.items()}
     if samples.mesh is not None:
         arrays |= {"vertices": samples.mesh.vertices, "faces": samples.mesh.faces}
     return {name: np.ascontiguousarray(array, dtype=DTYPES[name]) for name, array in arrays.items()}
@@ -96,20 +96,9 @@ class StoredShape:
     """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
     Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
-    open would count as this process's memory until they were the whole store.
-
-    Args:
-        id: as the source gave it.
-        path: of its file; links are not followed.
-        up: the axis that points up in the source's frame, for pictures.
-
-    Attributes:
-        record: all that is known of the shape; `record.reason` is set where it was rejected.
-        state: changes when the file is written anew.
-
-    Raises:
-        OSError: the file cannot be opened.
-        ValueError: its header is damaged, or it is shorter or longer than the header says.
+    open would count as this process's memory until they were the whole store. `up` is the axis that points up
+    in the source's frame; `state` changes when the file is written anew. A file that cannot be opened raises
+    OSError, one with a damaged header or of another length ValueError.
     """
 
     def __init__(self, id: str, path: Path, up: Literal["y", "z"] = "z"):
@@ -132,9 +121,9 @@ class StoredShape:
         size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
         if size != self._size:
             raise ValueError(f"it has {self._size} bytes, not {size}")
-        self.category, self.credits = self.record.category, self.record.credits
-        self.fingerprint = self.record.fingerprint
-        self.frame = Frame(np.array(self.record.center, dtype=np.float64), self.record.scale)
+        known = self.record
+        self.category, self.credits, self.fingerprint = known.category, known.credits, known.fingerprint
+        self.frame = Frame(np.array(known.center, dtype=np.float64), known.scale)
 
     @property
     def outside(self) -> np.ndarray:
@@ -216,16 +205,15 @@ class StoredShape:
 
 def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
     """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
-    rows = np.empty((count, 4), np.float32)
-    draw_signed(rows, shape, rng)
-    return rows
+    return draw_signed(np.empty((count, 4), np.float32), shape, rng)
 
 
-def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> None:
-    """Fills rows [N, 4], contiguous, with what `signed_samples` returns."""
+def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> np.ndarray:
+    """Fills rows [N, 4], contiguous, with what `signed_samples` returns; gives them back."""
     outside = len(rows) - len(rows) // 2
     draw_rows(rows[:outside], shape, "outside", rng)
     draw_rows(rows[outside:], shape, "inside", rng)
+    return rows
 
 
 def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
