@@ -1,7 +1,6 @@
 """Functions mapped over worker processes; a worker that dies costs one item, not the rest.
 
-The processes are loky's: new interpreters, not forks of a caller that has threads, and they do not run the
-caller's main script again, so that it needs no `if __name__ == "__main__"`.
+The processes are loky's: new interpreters, which do not run the caller's main script again.
 """
 
 import os
@@ -74,8 +73,7 @@ def stream_in_processes(function: Callable, items: Iterable, workers: int) -> It
 def _in_pool(function: Callable, items: dict[int, Any], workers: int) -> Iterator[tuple[int, Any]]:
     with _pool(function, workers) as pool:
         futures = {pool.submit(_call, item): index for index, item in items.items()}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
 
 
 @contextmanager

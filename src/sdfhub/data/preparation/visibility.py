@@ -5,7 +5,7 @@ seen from both sides are sheets without an inside.
 """
 
 import os
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -34,8 +34,7 @@ SOLID = 0.8  # winding number above which the space behind a face counts as soli
 TOUCH = 5e-6  # above a face: where a ray to the eye starts, so that a coincident face does not stop it
 
 
-@dataclass(frozen=True)
-class Surface:
+class Surface(NamedTuple):
     """The faces that bound a shape, oriented outwards, normalised frame."""
 
     vertices: np.ndarray  # [V, 3] float64
@@ -119,9 +118,8 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
         "contradictory": float((visible * wrong).sum() / (visible * total).sum()),
         "bad_faces": float((visible * (wrong > BAD * total)).sum() / visible.sum()),
     }
-    for name in ("two_sided_area", *(("contradictory", "bad_faces") if preparation.sign == "vote" else ())):
-        limit = getattr(preparation, f"max_{name}")
-        if statistics[name] > limit:
+    for name in ("two_sided_area", "contradictory", "bad_faces")[: 3 if preparation.sign == "vote" else 1]:
+        if statistics[name] > (limit := getattr(preparation, f"max_{name}")):
             raise RejectedMesh(name, f"{statistics[name]:.1%}, at most {limit:.0%} wanted")
     return Surface(mesh.vertices, np.ascontiguousarray(faces[kept]), two_sided[kept], statistics)
 
