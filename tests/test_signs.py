@@ -4,8 +4,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from manifold3d import Manifold, OpType
 
-from sdfhub.data.preparation.normalize import normalize_mesh
-from sdfhub.data.preparation.sampling import sample_points
+from sdfhub.data.preparation.sampling import normalize_mesh, sample_points
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.preparation.signs import ROOM, SIGN_METHODS, cut_long, nearest_points, winding_signs
 from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface

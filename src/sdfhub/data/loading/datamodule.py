@@ -78,7 +78,6 @@ class SdfDataModule(L.LightningDataModule):
         self.preparation, self.loader, self.validation_shapes = preparation, loader, validation_shapes
         self.train_shapes: list[StoredShape] = []
         self.held_out_shapes: list[StoredShape] = []
-        self._batches: StepBatches | None = None
 
     @cached_property
     def split(self) -> Split:
@@ -116,31 +115,27 @@ class SdfDataModule(L.LightningDataModule):
         return len(own), made
 
     def prepare_data(self) -> None:
-        """Fills the store; a second call does nothing.
-
-        Raises:
-            SdfhubError: too few shapes, no usable one, or normals are asked of a source that has none.
-        """
+        """Fills the store; a second call does nothing."""
         self.setup()
 
     def setup(self, stage: str | None = None) -> None:
         """Opens the store, filled as `prepare_data` does; a second call does nothing."""
-        if self._batches is not None:
+        if self.train_shapes:
             return
-        if self.loader.surface_per_shape and not self.source.has_normals:
-            name = self.source.name
-            raise SdfhubError(f"normals=on: the files of data={name} carry none; train with normals=off")
+        if self.loader.surface_per_shape and not (source := self.source).has_normals:
+            raise SdfhubError(
+                f"normals=on: the files of data={source.name} carry none; train with normals=off"
+            )
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
         if not self.train_shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")
-        self._batches = StepBatches(self.train_shapes, self.loader)
 
-    @property
+    @cached_property
     def batches(self) -> StepBatches:
         """Training batches by step, after `setup`."""
-        if self._batches is None:
+        if not self.train_shapes:
             raise SdfhubError("SdfDataModule: call prepare_data() and setup() first")
-        return self._batches
+        return StepBatches(self.train_shapes, self.loader)
 
     @property
     def rows(self) -> int:
@@ -152,7 +147,7 @@ class SdfDataModule(L.LightningDataModule):
         device = trainer.strategy.root_device if trainer else torch.device("cpu")
         resident = device.type != "cpu" if self.loader.resident is None else self.loader.resident
         if resident and not isinstance(self.batches, ResidentBatches):
-            self._batches = ResidentBatches(self.train_shapes, self.loader, device)
+            self.batches = ResidentBatches(self.train_shapes, self.loader, device)
         done = None
         if trainer:
             self.batches.share(trainer.global_rank, trainer.world_size)

@@ -69,13 +69,7 @@ def by_synset(categories: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
-    """The id of the shape whose samples lie at a path such as `ShapeNetV2/03001627/1a2b` below a root.
-
-    Args:
-        path: without suffix.
-        category_of: category of each synset.
-        above: name of the root.
-    """
+    """The id of the samples at a path such as `ShapeNetV2/03001627/1a2b` below a root called `above`."""
     *parents, stem = path.split("/")
     folder = "_".join(part for part in parents if part != _SAMPLES) or "folder"
     category = category_of.get(parents[-1] if parents else above, folder)

@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, StringConstraints
 
+from sdfhub.data.sources import source as sources
 from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path, read_mesh
-from sdfhub.data.sources.source import Shape, Source, checked_categories, digits, folder_safe, unique_ids
-from sdfhub.data.sources.split_file import with_roles
+from sdfhub.data.sources.source import Shape, Source, folder_safe
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples
 from sdfhub.whole_file import file_sha256
@@ -36,7 +36,7 @@ class SourceOfFiles(Source):
         self.train_split = train_split and os.path.abspath(train_split)
         self.test_split = test_split and os.path.abspath(test_split)
         place = self.root.resolve()
-        self.name = f"{kind}-{folder_safe(place.name)}-{digits(place)}"
+        self.name = f"{kind}-{folder_safe(place.name)}-{sources.digits(place)}"
         self._files: dict[str, Path] = {}
 
     @abstractmethod
@@ -53,7 +53,9 @@ class SourceOfFiles(Source):
             raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
         listed = list(self.listed())
         self._files = {shape.id: file for shape, file, _ in listed}
-        return with_roles([(shape, path) for shape, _, path in listed], self.train_split, self.test_split)
+        return sources.with_roles(
+            [(shape, path) for shape, _, path in listed], self.train_split, self.test_split
+        )
 
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
         if not self._files:
@@ -107,7 +109,7 @@ class FolderSource(SourceOfFiles):
         if missing := [name for name in self.categories if name not in there]:
             what = f"data.source.root={self.root} has no folder of that name, but {', '.join(there)}"
             raise SdfhubError(f"category={missing[0]}: {what}; without category= all are taken")
-        for id, file in sorted(unique_ids(ids, self.root).items()):
+        for id, file in sorted(sources.unique_ids(ids, self.root).items()):
             category = id.partition("/")[0]
             if category in (self.categories or there):
                 # a name may hold bytes of another encoding, which JSON would not take
@@ -157,7 +159,7 @@ class ShapeNetSource(SourceOfFiles):
         test_split: str | None = None,
     ):
         super().__init__("shapenet", root, train_split, test_split)
-        self.categories = sorted(checked_categories(categories, Category).items())
+        self.categories = sorted(sources.checked_categories(categories, Category).items())
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         for category, settings in self.categories:

@@ -60,14 +60,12 @@ class _Model:
     min_faces: int = 1
 
     def content(self) -> bytes:
-        if self.member:
-            return read_model(self.file, self.member)
-        if self.file.stat().st_size > MAX_BYTES:
-            raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft")
-        return self.file.read_bytes()
+        return read_model(self.file, self.member) if self.member else self.file.read_bytes()
 
     def triangles(self) -> Mesh:
         name = self.member or self.file.name
+        if self.file.stat().st_size > MAX_BYTES:
+            raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft or library")
         return triangles_of(self.content(), Path(name).suffix.lower(), f"{self.file.name}: {name}")
 
     def measured(self) -> dict[str, Any]:
