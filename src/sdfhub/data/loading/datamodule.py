@@ -122,10 +122,9 @@ class SdfDataModule(L.LightningDataModule):
         """Opens the store, filled as `prepare_data` does; a second call does nothing."""
         if self.train_shapes:
             return
-        if self.loader.surface_per_shape and not (source := self.source).has_normals:
-            raise SdfhubError(
-                f"normals=on: the files of data={source.name} carry none; train with normals=off"
-            )
+        if self.loader.surface_per_shape and not self.source.has_normals:
+            what = f"the files of data={self.source.name} carry none; train with normals=off"
+            raise SdfhubError(f"normals=on: {what}")
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
         if not self.train_shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")

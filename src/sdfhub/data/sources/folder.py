@@ -53,9 +53,8 @@ class SourceOfFiles(Source):
             raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
         listed = list(self.listed())
         self._files = {shape.id: file for shape, file, _ in listed}
-        return sources.with_roles(
-            [(shape, path) for shape, _, path in listed], self.train_split, self.test_split
-        )
+        paths = [(shape, path) for shape, _, path in listed]
+        return sources.with_roles(paths, self.train_split, self.test_split)
 
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
         if not self._files:

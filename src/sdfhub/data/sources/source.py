@@ -57,7 +57,7 @@ class Source(ABC):
 
     @abstractmethod
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
-        """The mesh of one shape in its source's frame, or its samples; RejectedMesh where it is not usable."""
+        """The mesh of one shape in its source's frame, or its samples; RejectedMesh where there is none."""
 
 
 def checked_categories(categories: Any, settings: type[Settings]) -> dict[str, Settings]:

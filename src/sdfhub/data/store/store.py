@@ -69,12 +69,10 @@ class Store(dict[str, StoredShape]):
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
-        lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
         such = {record.reason: f"{id} ({record.detail})" for id, record in self.rejected.items()}
         counts = Counter(record.reason for record in self.rejected.values()).most_common()
-        return "\n".join(
-            lines + [f"  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts]
-        )
+        rejected = "".join(f"\n  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts)
+        return f"{kept}; preparing took {seconds:.2f} s a shape{rejected}"
 
 
 def prepare(
@@ -96,7 +94,7 @@ def prepare(
         stored = _checked(folder, shapes, source, preparation)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
-        what = "; ".join(line.strip() for line in store.summary().splitlines())
+        what = store.summary().replace("\n  ", "; ")
         raise SdfhubError(f"none of the {len(shapes)} shapes of data={source.name} is usable: {what}")
     return store
 
@@ -156,8 +154,8 @@ def _record(shape: Shape, detail: str = "", **known: Any) -> Record:
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     """The shapes that are not in the store as they are now."""
-    fine = {id for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
-    return [s for s in shapes if s.id not in fine or stored[s.id].fingerprint != s.fingerprint]
+    final = {id: shape.fingerprint for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
+    return [shape for shape in shapes if final.get(shape.id) != shape.fingerprint]
 
 
 def _file(folder: Path, id: str) -> Path:
