@@ -58,9 +58,9 @@ def prepare_mesh(
     if count := preparation.surface_points:
         found = np.stack(sample_surface(surface.vertices, surface.solid(), count, rng))
         oriented = found[:, rng.permutation(count)]
-    arrays = (array.astype(np.float32) for array in (points, sdf, *oriented))
+    points, sdf, on_surface, normals = (array.astype(np.float32) for array in (points, sdf, *oriented))
     sampled = NormalizedMesh(surface.vertices, surface.faces, normalized.frame)
-    return ShapeSamples(*arrays, normalized.frame, sampled, statistics)
+    return ShapeSamples(points, sdf, on_surface, normals, normalized.frame, sampled, statistics)
 
 
 def _refuse_doubtful(certain: float, inside: float, limits: Preparation) -> None:
