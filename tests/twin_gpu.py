@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable
+from functools import cache
 
 import numpy as np
 import torch
@@ -15,8 +16,7 @@ from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from sdfhub.data.loading.batches import Augmentation, Loading
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading, ResidentBatches
 from sdfhub.geometry.grid import Grid
 from sdfhub.latent.gaussian import Gaussian
 from sdfhub.latent.problem import Problem, Rows
@@ -27,6 +27,7 @@ from tests.tiny import build_autodecoder, composed
 
 torch.utils.rename_privateuse1_backend("twin")
 GPU = torch.device("twin", 0)
+config_of = cache(composed)
 EXPERIMENTS = (
     *("deepsdf", "siren", "fft_siren", "fft_hosc", "hash_siren", "hash_hosc"),
     *("fft_finer", "fft_gauss", "fft_wire"),
@@ -53,7 +54,7 @@ class Stored:
 def model_of(experiment: str, *overrides: str) -> AutoDecoder:
     """A model for six shapes whose parameters and buffers are fakes on the device."""
     with torch._subclasses.fake_tensor.unset_fake_temporarily():
-        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6)
+        model = build_autodecoder(config_of(f"experiment={experiment}", *overrides), rows=6)
     for module in model.modules():
         for name, parameter in module._parameters.items():
             if parameter is not None:

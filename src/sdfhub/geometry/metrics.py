@@ -103,7 +103,7 @@ def judge(
         values |= _sampled_metrics(samples, expected)
         values |= _surface_metrics(samples[0], mesh, expected[0], true_mesh, tau)
         values["excess"] = values["cd"] - values["floor"]
-        values["cd_source"] = values["cd"] / float(truth.scale) ** 2
+        values["cd_source"] = values["cd"] / float(truth.frame.scale) ** 2
         values["iou"] = volumetric_iou(mesh, true_mesh, seed=seed)
     return ShapeMetrics(**values)
 
