@@ -1,40 +1,28 @@
 """Chairs: dining, Windsor, ladder-back, bentwood, cantilever, swivel, tulip, from one set of parameters."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import chair_backs, parts
-from sdfhub.procedural.parameters import choice, continuous
 
 
-@dataclass(frozen=True)
-class Chair:
+class Chair(SimpleNamespace):
     """One chair. Lengths in metres; seat, back and legs combine freely."""
 
-    seat_height: float = continuous(0.40, 0.50)
-    seat_width: float = continuous(0.40, 0.56)
-    seat_depth: float = continuous(0.38, 0.50)
-    seat_thickness: float = continuous(0.025, 0.075)
-    seat_taper: float = continuous(0.74, 0.98)
-    back_height: float = continuous(0.34, 0.62)
-    back_lean: float = continuous(0.03, 0.14)
-    back_curve: float = continuous(0.0, 0.07)
-    back_thickness: float = continuous(0.018, 0.05)
-    leg_width: float = continuous(0.028, 0.046)
-    leg_taper: float = continuous(0.5, 0.95)
-    leg_splay: float = continuous(0.0, 0.075)
-    stretcher_height: float = continuous(0.22, 0.5)
-    arm_height: float = continuous(0.17, 0.25)
-    spindle_width: float = continuous(0.017, 0.025)
-    seat: str = choice("square", "tapered", "round")
-    back: str = choice("slats", "spindles", "ladder", "solid", "hoop", "panel")
-    legs: str = choice("square", "square", "turned", "round", "round", "sled", "cantilever", "star", "tulip")
-    arms: str = choice("none", "none", "none", "straight", "curved")
-    stretchers: str = choice("none", "none", "sides", "h", "box")
-    apron: bool = choice(True, False)
-    slats: int = choice(3, 4, 5, 6, 7)
+    parameters: ClassVar = dict(
+        seat_height=(0.4, 0.5), seat_width=(0.4, 0.56), seat_depth=(0.38, 0.5),
+        seat_thickness=(0.025, 0.075), seat_taper=(0.74, 0.98), back_height=(0.34, 0.62),
+        back_lean=(0.03, 0.14), back_curve=(0.0, 0.07), back_thickness=(0.018, 0.05),
+        leg_width=(0.028, 0.046), leg_taper=(0.5, 0.95), leg_splay=(0.0, 0.075),
+        stretcher_height=(0.22, 0.5), arm_height=(0.17, 0.25), spindle_width=(0.017, 0.025),
+        seat=["square", "tapered", "round"], back=["slats", "spindles", "ladder", "solid", "hoop", "panel"],
+        legs=["square", "square", "turned", "round", "round", "sled", "cantilever", "star", "tulip"],
+        arms=["none", "none", "none", "straight", "curved"],
+        stretchers=["none", "none", "sides", "h", "box"], apron=[True, False], slats=[3, 4, 5, 6, 7],
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The chair as one solid, standing on z = 0."""

@@ -1,13 +1,13 @@
 """Lamps: floor, table, desk, arc and tripod lamps and pendants, as one parametric design."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 from itertools import pairwise
 
 import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import lamp_shades, parts
-from sdfhub.procedural.parameters import choice, continuous
 
 _HEIGHT = {"floor": 1.5, "table": 0.56, "desk": 0.52, "arc": 1.8, "tripod": 1.45, "pendant": 0.8}
 _SHADE = {"floor": 0.3, "table": 0.6, "desk": 0.36, "arc": 0.27, "tripod": 0.37, "pendant": 0.58}
@@ -15,31 +15,19 @@ _STURDY = {"desk": 1.1, "arc": 1.2}  # where reach makes the lamp large against 
 _BASE = {"floor": 0.22, "table": 0.36, "desk": 0.38, "arc": 0.24, "tripod": 0.3, "pendant": 0.18}
 
 
-@dataclass(frozen=True)
-class Lamp:
+class Lamp(SimpleNamespace):
     """A lamp: a shade with its bulb on a stem that stands on a base or hangs from a canopy."""
 
-    size: float = continuous(0.85, 1.15)
-    shade_width: float = continuous(0.8, 1.2)
-    shade_height: float = continuous(0.55, 0.9)
-    shade_taper: float = continuous(0.4, 0.8)
-    wall: float = continuous(0.022, 0.03)
-    stem: float = continuous(0.012, 0.02)
-    base_width: float = continuous(0.8, 1.2)
-    base_height: float = continuous(0.03, 0.07)
-    belly: float = continuous(0.35, 0.65)
-    reach: float = continuous(0.45, 0.75)
-    elbow: float = continuous(0.4, 0.62)
-    tilt: float = continuous(0.0, 40.0)
-    kind: str = choice("floor", *["table"] * 3, "desk", "desk", "arc", "tripod", "pendant", "pendant")
-    shade: str = choice("drum", "cone", "cone", "bell", "pleated", "dome", "globe", "bowl")
-    base: str = choice("disc", "disc", "cube", "feet", "vase", "gourd", "turned", "bottle")
-    arm: str = choice("single", "paired", "bent")
-    fitting: str = choice("spider", "harp", "rings")
-    finial: bool = choice(True, False)
-    collar: bool = choice(True, False)
-    lights: int = choice(1, 1, 3)
-    pleats: int = choice(14, 18, 22)
+    parameters: ClassVar = dict(
+        size=(0.85, 1.15), shade_width=(0.8, 1.2), shade_height=(0.55, 0.9), shade_taper=(0.4, 0.8),
+        wall=(0.022, 0.03), stem=(0.012, 0.02), base_width=(0.8, 1.2), base_height=(0.03, 0.07),
+        belly=(0.35, 0.65), reach=(0.45, 0.75), elbow=(0.4, 0.62), tilt=(0.0, 40.0),
+        kind=["floor", "table", "table", "table", "desk", "desk", "arc", "tripod", "pendant", "pendant"],
+        shade=["drum", "cone", "cone", "bell", "pleated", "dome", "globe", "bowl"],
+        base=["disc", "disc", "cube", "feet", "vase", "gourd", "turned", "bottle"],
+        arm=["single", "paired", "bent"], fitting=["spider", "harp", "rings"], finial=[True, False],
+        collar=[True, False], lights=[1, 1, 3], pleats=[14, 18, 22],
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The lamp as one solid; a standing one stands on z = 0."""

@@ -1,14 +1,14 @@
 """Aircraft: airliners, business jets, turboprops, light singles, gliders, fighters; one set of parameters."""
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import parts, plane_engines, plane_gear, plane_tails
 from sdfhub.procedural import plane_parts as pp
-from sdfhub.procedural.parameters import choice, continuous
 
 
 class Proportions(NamedTuple):
@@ -102,37 +102,22 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class Plane:
+class Plane(SimpleNamespace):
     """One aircraft, its nose towards -y. Numbers scale or shift the proportions of its kind; what a kind
     cannot have is read as its nearest: a jet with a tail wheel stands on a nose wheel."""
 
-    kind: str = choice(*KINDS)
-    mount: str = choice("low", "low", "mid", "high", "high")
-    tail: str = choice("conventional", "conventional", "t", "v", "twin", "cruciform")
-    gear: str = choice("tricycle", "taildragger", "retracted", "retracted")
-    tips: str = choice("plain", "winglet", "tank")
-    engines: int = choice(1, 1, 2)
-    blades: int = choice(2, 3, 4)
-    spats: bool = choice(True, False)
-    size: float = continuous(0.8, 1.25)
-    girth: float = continuous(0.88, 1.15)
-    nose_length: float = continuous(0.8, 1.3)
-    nose_droop: float = continuous(0.0, 0.45)
-    upsweep: float = continuous(0.3, 0.9)
-    span: float = continuous(0.88, 1.12)
-    chord: float = continuous(0.88, 1.15)
-    taper: float = continuous(0.8, 1.25)
-    sweep: float = continuous(-4.0, 7.0)
-    dihedral: float = continuous(1.0, 6.5)
-    wing_shift: float = continuous(-0.03, 0.03)
-    tail_size: float = continuous(0.88, 1.15)
-    fin_sweep: float = continuous(-8.0, 10.0)
-    engine_size: float = continuous(0.88, 1.15)
-    engine_shift: float = continuous(-0.04, 0.05)
-    canopy_height: float = continuous(0.85, 1.25)
-    winglet_height: float = continuous(0.1, 0.17)
-    blade_turn: float = continuous(0.0, 90.0)
+    parameters: ClassVar = dict(
+        kind=["airliner", "business jet", "turboprop", "single", "glider", "fighter"],
+        mount=["low", "low", "mid", "high", "high"],
+        tail=["conventional", "conventional", "t", "v", "twin", "cruciform"],
+        gear=["tricycle", "taildragger", "retracted", "retracted"], tips=["plain", "winglet", "tank"],
+        engines=[1, 1, 2], blades=[2, 3, 4], spats=[True, False], size=(0.8, 1.25), girth=(0.88, 1.15),
+        nose_length=(0.8, 1.3), nose_droop=(0.0, 0.45), upsweep=(0.3, 0.9), span=(0.88, 1.12),
+        chord=(0.88, 1.15), taper=(0.8, 1.25), sweep=(-4.0, 7.0), dihedral=(1.0, 6.5),
+        wing_shift=(-0.03, 0.03), tail_size=(0.88, 1.15), fin_sweep=(-8.0, 10.0), engine_size=(0.88, 1.15),
+        engine_shift=(-0.04, 0.05), canopy_height=(0.85, 1.25), winglet_height=(0.1, 0.17),
+        blade_turn=(0.0, 90.0),
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The aircraft as one solid."""

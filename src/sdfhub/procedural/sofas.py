@@ -1,45 +1,31 @@
 """Sofas: track, rolled, winged, Chesterfield, camelback, modular and chaise, from one set of parameters."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
 from sdfhub.procedural import parts, sofa_backs, sofa_cushions
-from sdfhub.procedural.parameters import choice, continuous
 
 
-@dataclass(frozen=True)
-class Sofa:
+class Sofa(SimpleNamespace):
     """One sofa. Lengths in metres; arms, back, cushions and legs combine freely."""
 
-    seat_width: float = continuous(0.54, 0.74)
-    seat_depth: float = continuous(0.58, 0.72)
-    seat_height: float = continuous(0.40, 0.48)
-    cushion_height: float = continuous(0.11, 0.18)
-    cushion_radius: float = continuous(0.025, 0.055)
-    crown: float = continuous(0.0, 0.04)
-    gap: float = continuous(0.012, 0.03)
-    back_height: float = continuous(0.30, 0.50)
-    back_thickness: float = continuous(0.13, 0.2)
-    back_lean: float = continuous(0.03, 0.14)
-    hump: float = continuous(0.07, 0.16)
-    channel_width: float = continuous(0.12, 0.22)
-    arm_width: float = continuous(0.10, 0.22)
-    arm_height: float = continuous(0.13, 0.26)
-    arm_slope: float = continuous(0.3, 0.8)
-    leg_height: float = continuous(0.07, 0.16)
-    leg_width: float = continuous(0.036, 0.06)
-    leg_splay: float = continuous(0.0, 0.05)
-    chaise_length: float = continuous(0.45, 0.8)
-    pillow_size: float = continuous(0.34, 0.44)
-    seats: int = choice(1, 2, 2, 3, 3, 4)
-    arms: str = choice("track", "square", "rolled", "rolled", "sloped", "wing", "none")
-    back: str = choice("tight", "cushions", "cushions", "channels", "camel", "tufted", "chesterfield")
-    seat: str = choice("separate", "separate", "separate", "bench")
-    legs: str = choice("block", "tapered", "tapered", "turned", "sled", "plinth")
-    chaise: str = choice("none", "none", "none", "none", "left", "right")
-    pillows: str = choice("none", "none", "one", "two", "bolsters")
+    parameters: ClassVar = dict(
+        seat_width=(0.54, 0.74), seat_depth=(0.58, 0.72), seat_height=(0.4, 0.48),
+        cushion_height=(0.11, 0.18), cushion_radius=(0.025, 0.055), crown=(0.0, 0.04), gap=(0.012, 0.03),
+        back_height=(0.3, 0.5), back_thickness=(0.13, 0.2), back_lean=(0.03, 0.14), hump=(0.07, 0.16),
+        channel_width=(0.12, 0.22), arm_width=(0.1, 0.22), arm_height=(0.13, 0.26), arm_slope=(0.3, 0.8),
+        leg_height=(0.07, 0.16), leg_width=(0.036, 0.06), leg_splay=(0.0, 0.05), chaise_length=(0.45, 0.8),
+        pillow_size=(0.34, 0.44), seats=[1, 2, 2, 3, 3, 4],
+        arms=["track", "square", "rolled", "rolled", "sloped", "wing", "none"],
+        back=["tight", "cushions", "cushions", "channels", "camel", "tufted", "chesterfield"],
+        seat=["separate", "separate", "separate", "bench"],
+        legs=["block", "tapered", "tapered", "turned", "sled", "plinth"],
+        chaise=["none", "none", "none", "none", "left", "right"],
+        pillows=["none", "none", "one", "two", "bolsters"],
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The sofa as one solid, standing on z = 0."""

@@ -1,38 +1,26 @@
 """Tables: dining, coffee, farmhouse, trestle, pedestal, hairpin and slab, from one set of parameters."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import parts
-from sdfhub.procedural.parameters import choice, continuous
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(SimpleNamespace):
     """One table. Lengths in metres; its length runs along x."""
 
-    height: float = continuous(0.42, 0.80)
-    length: float = continuous(0.80, 1.45)
-    depth: float = continuous(0.52, 0.85)
-    top_thickness: float = continuous(0.026, 0.055)
-    edge_round: float = continuous(0.0, 0.48)
-    overhang: float = continuous(0.02, 0.12)
-    leg_width: float = continuous(0.042, 0.085)
-    leg_taper: float = continuous(0.45, 0.95)
-    leg_splay: float = continuous(0.0, 0.10)
-    apron_height: float = continuous(0.05, 0.12)
-    stretcher_height: float = continuous(0.16, 0.34)
-    foot_reach: float = continuous(0.55, 0.8)
-    top: str = choice("rectangle", "rectangle", "rounded", "boat", "oval", "round")
-    base: str = choice(
-        "square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop"
-    )
-    stretchers: str = choice("none", "none", "h", "box", "shelf")
-    apron: bool = choice(True, False)
-    drawers: int = choice(0, 0, 1, 2, 3)
-    feet: int = choice(3, 4, 5)
+    parameters: ClassVar = dict(
+        height=(0.42, 0.8), length=(0.8, 1.45), depth=(0.52, 0.85), top_thickness=(0.026, 0.055),
+        edge_round=(0.0, 0.48), overhang=(0.02, 0.12), leg_width=(0.042, 0.085), leg_taper=(0.45, 0.95),
+        leg_splay=(0.0, 0.1), apron_height=(0.05, 0.12), stretcher_height=(0.16, 0.34),
+        foot_reach=(0.55, 0.8), top=["rectangle", "rectangle", "rounded", "boat", "oval", "round"],
+        base=["square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop"],
+        stretchers=["none", "none", "h", "box", "shelf"], apron=[True, False], drawers=[0, 0, 1, 2, 3],
+        feet=[3, 4, 5],
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The table as one solid, standing on z = 0."""
