@@ -97,7 +97,7 @@ def _shell(chair, low: float, thick: float, round_top: float) -> Manifold:
         front = [point(chair, side, h) - [0, thick / 2, 0] for h in np.linspace(low, top, 6)]
         rear = [point(chair, side, h) + [0, thick / 2, 0] for h in np.linspace(top, low, 6)]
         sections.append(front + rear)
-    return parts.loft(np.array(sections))
+    return parts.loft(sections)
 
 
 def _solid(chair) -> list[Manifold]:

@@ -53,7 +53,7 @@ def _pleated(lamp, tall: float) -> Manifold:
         for share in np.array([-overshoot, 1 + overshoot]):
             radius = _radius(lamp, share) + offset
             rings.append(np.column_stack([radius * ring, np.full(len(ring), share * tall)]))
-        return parts.loft(np.array(rings))
+        return parts.loft(rings)
 
     wall = lamp.wall_thickness()
     return solid(0.6 * wall, 0.0) - solid(-0.6 * wall, 0.05)

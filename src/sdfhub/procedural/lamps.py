@@ -1,8 +1,8 @@
 """Lamps: floor, table, desk, arc and tripod lamps and pendants, as one parametric design."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import ClassVar
-from itertools import pairwise
 
 import numpy as np
 from manifold3d import Manifold

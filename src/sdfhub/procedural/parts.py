@@ -61,8 +61,9 @@ def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
     return Manifold.extrude(section, top - bottom).translate((0.0, 0.0, float(bottom)))
 
 
-def loft(sections: np.ndarray) -> Manifold:
+def loft(rings: Sequence | np.ndarray) -> Manifold:
     """The solid with flat ends through star-shaped sections [K, N, 3], all with one sense of rotation."""
+    sections = np.asarray(rings, float)
     vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
     faces = _loft_faces(*sections.shape[:2])
     a, b, c = np.moveaxis((vertices - vertices.mean(0))[faces], 1, 0)
@@ -132,7 +133,7 @@ def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifol
     turn = 2 * np.pi / segments
     ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
     rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in np.asarray(profile, float)]
-    return loft(np.array(rings))
+    return loft(rings)
 
 
 def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:

@@ -98,4 +98,4 @@ def _intake(plane) -> Manifold:
         x = plane.body.radius * (0.62 + 0.38 * share) + (share * wide - shrink) * unit[:, 0]
         z = -0.1 * tall + (share * tall - shrink) * unit[:, 1]
         rings.append(np.column_stack([x, y - rake * unit[:, 1], z]))
-    return parts.loft(np.array(rings))
+    return parts.loft(rings)

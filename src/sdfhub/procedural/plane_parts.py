@@ -61,7 +61,7 @@ class Fuselage:
         centre = cap.mean(0)
         for share in (0.8, 0.4):
             body.append(centre + (cap - centre) * share + [0, 0.6 * self.radius * self.end * (1 - share), 0])
-        return parts.loft(np.array(body))
+        return parts.loft(body)
 
     def _phases(self, y: float) -> tuple[float, float]:
         """How far y lies into the nose and into the tail, each 0 in the cabin and 1 at the end."""
@@ -109,7 +109,7 @@ def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber:
         up = np.concatenate([mean + offset, (mean - offset)[:0:-1]])
         across = np.outer(up, [-np.sin(s.roll), 0, np.cos(s.roll)])
         sections.append(np.array(s.leading_edge) + across + np.outer(y, [0, 1, 0]))
-    return parts.loft(np.array(sections))
+    return parts.loft(sections)
 
 
 def panel(root, direction, length: float, chords, sweep: float, ratio: float, gauge: float) -> Manifold:
@@ -153,7 +153,7 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
         c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
         flat = ring @ np.array([[c, s], [-s, c]])
         sections.append(np.column_stack([flat, np.full(len(ring), share * radius)]))
-    blade = parts.loft(np.array(sections))
+    blade = parts.loft(sections)
     for k in range(blades):
         made.append(blade.rotate((0.0, turn + 360.0 * k / blades, 0.0)).translate(tuple(map(float, centre))))
     return made
@@ -166,9 +166,9 @@ def wheel(radius: float, width: float, centre) -> Manifold:
     return parts.lathe(profile, 16).rotate((0.0, 90.0, 0.0)).translate(tuple(map(float, centre)))
 
 
-def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
-    """A bubble on the height base(y): a fighter's canopy, a light aircraft's cabin. It is highest, and
-    `half_width` wide to either side, at the share `peak` of its length."""
+def canopy(body, front: float, back: float, peak: float, foot: float, half_width: float, height: float):
+    """A bubble on a body from `foot` half heights above its axis: a fighter's canopy, a light aircraft's
+    cabin. It is highest, and `half_width` wide to either side, at the share `peak` of its length."""
     unit = superellipse(16, 2.4)
     sections = []
     for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 11))) / 2:
@@ -176,7 +176,7 @@ def canopy(front: float, back: float, peak: float, base, half_width: float, heig
         rise = (1 - side**2) ** 0.62
         y = front + t * (back - front)
         wide = half_width * (0.3 + 0.7 * rise)
-        ring = unit * [wide, 1.0]
-        z = base(y) + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
-        sections.append(np.column_stack([ring[:, 0], np.full(len(unit), y), z]))
-    return parts.loft(np.array(sections))
+        base = body.axis(y) + foot * body.half_height(y)
+        z = base + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
+        sections.append(np.column_stack([wide * unit[:, 0], np.full(len(unit), y), z]))
+    return parts.loft(sections)

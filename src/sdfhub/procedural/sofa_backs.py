@@ -48,7 +48,7 @@ def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Mani
         t, z = np.concatenate([t, back_t]), np.concatenate([z, back_z])
         y = sofa.seat_depth / 2 + t + _lean(sofa, z)
         sections.append(np.column_stack([np.full(len(z), s), y, z]))
-    return parts.loft(np.array(sections))
+    return parts.loft(sections)
 
 
 def _level(sofa, count: int = 2) -> tuple[np.ndarray, np.ndarray]:

@@ -85,5 +85,5 @@ def _pillow(size: float, centre, yaw: float) -> Manifold:
         thick = side * (0.016 + 0.17 * size * swell)
         across = 0.5 * size * u * (0.92 + 0.08 * around**4)
         sections.append(np.column_stack([across, thick, height]))
-    leaning = parts.loft(np.array(sections)).rotate((-17, 0, 0)).rotate((0, 0, yaw))
+    leaning = parts.loft(sections).rotate((-17, 0, 0)).rotate((0, 0, yaw))
     return leaning.translate(tuple(map(float, centre)))

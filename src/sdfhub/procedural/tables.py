@@ -17,7 +17,9 @@ class Table(SimpleNamespace):
         edge_round=(0.0, 0.48), overhang=(0.02, 0.12), leg_width=(0.042, 0.085), leg_taper=(0.45, 0.95),
         leg_splay=(0.0, 0.1), apron_height=(0.05, 0.12), stretcher_height=(0.16, 0.34),
         foot_reach=(0.55, 0.8), top=["rectangle", "rectangle", "rounded", "boat", "oval", "round"],
-        base=["square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop"],
+        base=[
+            "square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop",
+        ],
         stretchers=["none", "none", "h", "box", "shelf"], apron=[True, False], drawers=[0, 0, 1, 2, 3],
         feet=[3, 4, 5],
     )  # fmt: skip
@@ -183,7 +185,7 @@ class Table(SimpleNamespace):
             ring = parts.rounded_rectangle(thick, 2 * y, 0.006)
             ends = ((foot, 0.0), (top, self._under()))
             rings = [np.column_stack([ring + [c, 0], np.full(len(ring), level)]) for c, level in ends]
-            made.append(parts.loft(np.array(rings)))
+            made.append(parts.loft(rings))
         z = self.height - self.top_thickness - self.apron_height / 2 + 0.01
         made.append(parts.plank((-x, 0, z), (x, 0, z), 0.03, self.apron_height + 0.02))
         if self.stretchers == "shelf":
