@@ -110,20 +110,10 @@ def _cushions(sofa) -> list[Manifold]:
 
 def _chesterfield(sofa) -> list[Manifold]:
     """Arms and back of one height: an upright and a roll along its top, round the corners."""
-    thick, radius = upright(sofa), 0.4 * sofa.arm_width + 0.03
+    thick, radius = sofa.wall, 0.4 * sofa.arm_width + 0.03
     x, rear = sofa.half_seat + thick / 2, sofa.rear - thick / 2
     axis, low = sofa.seat_height + sofa.arm_height + 0.1 - radius, sofa.leg_height
     plan = [(-x, sofa.front, 0), (-x, rear, 0), (x, rear, 0), (x, sofa.front, 0)]
-    path = parts.filleted(plan, corner(sofa), 8) + [0, 0, axis]
+    path = parts.filleted(plan, sofa.bend, 8) + [0, 0, axis]
     section = np.array([(-thick / 2, low - axis), (thick / 2, low - axis), (thick / 2, 0), (-thick / 2, 0)])
     return [parts.sweep(path, section), parts.tube(path, radius, 24)]
-
-
-def upright(sofa) -> float:
-    """Thickness of the Chesterfield's wall."""
-    return 0.8 * sofa.arm_width
-
-
-def corner(sofa) -> float:
-    """How far from its corners the Chesterfield's wall begins to turn."""
-    return 0.14 + 0.5 * sofa.hump

@@ -30,13 +30,13 @@ def spans(sofa, count: int) -> list[tuple[float, float]]:
 def seats(sofa) -> list[Manifold]:
     """The cushions one sits on, sunk into the deck by their rounding so that nothing is hollow below them."""
     placed = [(a, b, sofa.front) for a, b in spans(sofa, 1 if sofa.seat == "bench" else sofa.seats)]
-    if chaise := sofa.chaise_span():
-        front = sofa.front - sofa.chaise_length
-        if sofa.seat == "bench" or chaise[1] - chaise[0] > 1.01 * 2 * sofa.half_seat / sofa.seats:
-            placed.append((chaise[0], chaise[1], front))
+    if sofa.chaise_span:
+        left, right = sofa.chaise_span
+        if sofa.seat == "bench" or right - left > 1.01 * 2 * sofa.half_seat / sofa.seats:
+            placed.append((left, right, sofa.chaise_front))
         else:
             at = 0 if sofa.chaise == "left" else -1
-            placed[at] = (*placed[at][:2], front)
+            placed[at] = (*placed[at][:2], sofa.chaise_front)
     made = []
     for left, right, front in placed:
         rear, low = sofa.back_face + sofa.cushion_radius + 0.012, sofa.deck - 0.6 * sofa.cushion_radius
