@@ -213,6 +213,11 @@ def stretchers(joints: Sequence[np.ndarray], style: str) -> list[tuple[np.ndarra
     return [*sides, (left, right), (rear_left, rear_right)] if style == "box" else sides
 
 
+def level(outline: np.ndarray, z: float) -> np.ndarray:
+    """Points [N, 3] of an outline [N, 2] at height z."""
+    return np.column_stack([outline, np.full(len(outline), z)])
+
+
 def mirrored(part: Manifold) -> list[Manifold]:
     """The part and its mirror image across x = 0."""
     return [part, part.mirror((1.0, 0.0, 0.0))]
