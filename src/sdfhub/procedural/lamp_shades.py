@@ -54,9 +54,8 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
         shell = _pleated(lamp, tall)
     else:
         share = np.linspace(0, 1, 12 if lamp.shade == "bell" else 2)
-        shell = parts.revolve_shell(
-            np.column_stack([_radius(lamp, share), tall * share]), lamp.shade_wall, 40
-        )
+        profile = np.column_stack([_radius(lamp, share), tall * share])
+        shell = parts.revolve_shell(profile, lamp.shade_wall, 40)
     size, at = 0.2 * lamp.diameter * lamp.shade_taper, 0.9
     made = [shell, *_spider(lamp, tall, at, gauge)]
     if hung:
