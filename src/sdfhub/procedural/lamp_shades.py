@@ -26,7 +26,7 @@ def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold
     return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), rod(low, high, socket)]
 
 
-def _radius(lamp, share: np.ndarray) -> np.ndarray:
+def _radius(lamp, share):
     """Radius of an open shade at a share of its height."""
     wide = lamp.diameter / 2
     if lamp.shade == "drum":
@@ -76,7 +76,7 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
 
 
 def _spider(lamp, tall: float, share: float, gauge: float) -> list[Manifold]:
-    reach, z = float(_radius(lamp, np.array(share))), share * tall
+    reach, z = _radius(lamp, share), share * tall
     reach *= 1 - (0.9 / lamp.pleats if lamp.shade == "pleated" else 0.0)
     wires = [parts.bar((0, 0, z), reach * out + [0, 0, z], 0.8 * gauge) for out in _THIRDS]
     return [*wires, rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]

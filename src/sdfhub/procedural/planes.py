@@ -70,7 +70,7 @@ class Plane(SimpleNamespace):
         return whole.scale((self.base.length * self.size,) * 3)
 
     def _measure(self) -> None:
-        """Sets what several parts share: proportions, fuselage, least thickness, half span, sweep."""
+        """Sets what several parts share: proportions, fuselage, least thickness, half span, sweeps."""
         self.base, b = KINDS[self.kind], BODIES[self.kind]
         # A share of the bounding radius, so that the thinnest parts can be sampled.
         self.gauge = 0.0092 * max(1.06, self.base.span * self.span)
@@ -81,6 +81,10 @@ class Plane(SimpleNamespace):
         self.semi_span = self.base.span * self.span / 2
         straight = self.kind in ("turboprop", "single", "glider")
         self.wing_sweep = self.base.sweep + (0.3 if straight else 1.0) * self.sweep
+        fast = self.kind in ("airliner", "business jet", "fighter")
+        self.fin_angle = (40 if fast else 24) + self.fin_sweep
+        self.tail_angle = (34 if fast else 8) + 0.5 * self.fin_sweep
+        self.tail_scale = self.base.tail_size * self.tail_size
 
     def leading_edge(self, share: float) -> np.ndarray:
         """[3] point of the right wing's leading edge; share 0 is the centre line, 1 the tip."""
@@ -109,10 +113,10 @@ class Plane(SimpleNamespace):
 
     def _wing(self) -> list[Manifold]:
         roll = np.arctan2(*(self.leading_edge(1) - self.leading_edge(0))[[2, 0]])
-        half = [pp.Station(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
+        half = [(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
         half += self._wing_tip(roll)
-        left = [pp.Station(s.leading_edge * np.array([-1, 1, 1]), s.chord, -s.roll) for s in reversed(half)]
-        middle = pp.Station(self.leading_edge(0), self.wing_chord(0))
+        left = [(edge * [-1, 1, 1], chord, -turn) for edge, chord, turn in reversed(half)]
+        middle = self.leading_edge(0), self.wing_chord(0), 0.0
         ratio = 0.06 if self.kind == "fighter" else 0.13
         wing = pp.lifting_surface([*left, middle, *half], ratio, self.gauge, 0.0 if ratio < 0.1 else 0.015)
         if self.tips != "tank" or self.kind in ("airliner", "glider"):
@@ -122,15 +126,15 @@ class Plane(SimpleNamespace):
         tank = pp.body_of_revolution(parts.scaled(shape, r, a), self.wing_point(0.99, 0.5), 16)
         return [wing, *parts.mirrored(tank)]
 
-    def _wing_tip(self, roll: float) -> list[pp.Station]:
+    def _wing_tip(self, roll: float) -> list[tuple[np.ndarray, float, float]]:
         """Sections beyond 97% of the half span: rounded off, or turned up into a winglet."""
         tip, chord = self.leading_edge(1), self.wing_chord(1)
         if self.tips != "winglet" or self.kind in ("fighter", "single"):
-            return [pp.Station(tip + [0, 0.12 * chord, 0], 0.8 * chord, roll)]
+            return [(tip + [0, 0.12 * chord, 0], 0.8 * chord, roll)]
         tall, stations = self.winglet_height * self.semi_span, []
         for up, out, trim, turn in ((0.06, 0.12, 0.06, 0.45), (0.22, 0.24, 0.2, 0.9), (1.0, 0.5, 0.8, 1.0)):
             point = tip + np.array([out * tall, trim * min(chord, tall), up * tall])
-            stations.append(pp.Station(point, chord * (1 - 0.55 * trim), roll + turn * (1.2 - roll)))
+            stations.append((point, chord * (1 - 0.55 * trim), roll + turn * (1.2 - roll)))
         return stations
 
     def _windscreen(self, body: Manifold) -> Manifold:

@@ -27,18 +27,16 @@ class Table(SimpleNamespace):
     def build(self) -> Manifold:
         """The table as one solid, standing on z = 0."""
         self._measure()
-        bases = dict(trestle=self._trestle, cross=self._cross, pedestal=self._pedestal, slab=self._slab)
-        base = bases.get(self.base, self._loop if self.base == "loop" else self._four_legs)
-        return parts.union([self._top(), *base()])
+        bases = dict(trestle=self._trestle, cross=self._cross, pedestal=self._pedestal)
+        bases |= dict(slab=self._slab, loop=self._loop)
+        return parts.union([self._top(), *bases.get(self.base, self._four_legs)()])
 
     def _measure(self) -> None:
         """Sets what several parts share."""
-        length, depth = self.length, self.depth
+        length, depth, thick = self.length, self.depth, self.top_thickness
         self.extent = np.array([length, depth]) if self.top != "round" else np.full(2, 0.5 * (length + depth))
-        self.under = self.height - 0.6 * self.top_thickness  # z within the top where what carries it ends
-        self.rail = (
-            self.height - self.top_thickness - self.apron_height / 2 + 0.01
-        )  # z of boards below the top
+        # z within the top where what carries it ends; z of the boards below it.
+        self.under, self.rail = self.height - 0.6 * thick, self.height - thick - self.apron_height / 2 + 0.01
         # (x, y) of the legs' axes in the quadrant where both are positive, under every kind of top.
         share = {"rectangle": 1.0, "rounded": 1.0, "boat": 0.84, "oval": 0.74, "round": 0.7}[self.top]
         cut = 0.09 * self.extent[1] if self.top == "rounded" else 0.0  # what its round corners take away
@@ -48,9 +46,8 @@ class Table(SimpleNamespace):
     def _top(self) -> Manifold:
         length, depth = self.extent
         if self.top in ("rectangle", "rounded"):
-            outline = parts.rounded_rectangle(
-                length, depth, 0.008 if self.top == "rectangle" else 0.28 * depth
-            )
+            rounding = 0.008 if self.top == "rectangle" else 0.28 * depth
+            outline = parts.rounded_rectangle(length, depth, rounding)
         else:
             unit, power = parts.circle(56), {"boat": 0.42, "oval": 0.82, "round": 1.0}[self.top]
             outline = np.sign(unit) * np.abs(unit) ** power * [length / 2, depth / 2]
