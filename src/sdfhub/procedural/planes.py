@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from manifold3d import Manifold
 
-from sdfhub.procedural import parts, plane_engines, plane_gear, plane_tails
+from sdfhub.procedural import parts, plane_engines, plane_tails
 from sdfhub.procedural import plane_parts as pp
 
 
@@ -66,7 +66,7 @@ class Plane(SimpleNamespace):
         if self.kind in ("airliner", "business jet", "turboprop"):
             body = self._windscreen(body)
         solids = [body, *self._wing(), *plane_tails.tail(self), *plane_engines.powerplant(self)]
-        whole = parts.union([*solids, *self._canopy(), *plane_gear.gear(self)])
+        whole = parts.union([*solids, *self._canopy(), *plane_engines.gear(self)])
         return whole.scale((self.base.length * self.size,) * 3)
 
     def _measure(self) -> None:

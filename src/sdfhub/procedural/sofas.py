@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from sdfhub.procedural import parts, sofa_backs, sofa_cushions
+from sdfhub.procedural import parts, sofa_upholstery
 
 
 class Sofa(SimpleNamespace):
@@ -30,8 +30,8 @@ class Sofa(SimpleNamespace):
     def build(self) -> Manifold:
         """The sofa as one solid, standing on z = 0."""
         self._measure()
-        made = [*self._frame(), *self._arms(), *self._legs(), *sofa_backs.back(self)]
-        return parts.union([*made, *sofa_cushions.seats(self), *sofa_cushions.loose(self)])
+        made = [*self._frame(), *self._arms(), *self._legs(), *sofa_upholstery.back(self)]
+        return parts.union([*made, *sofa_upholstery.seats(self), *sofa_upholstery.loose(self)])
 
     def _measure(self) -> None:
         """Sets what several parts share."""
