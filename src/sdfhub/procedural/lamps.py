@@ -67,6 +67,9 @@ class Lamp(SimpleNamespace):
     def _plinth(self) -> list[Manifold]:
         """A flat base: a disc, a block or three bent feet."""
         r, h, g = self.foot, self.base_height * min(self.tall, 1.0), self.gauge
+        if self.base == "cube" and self.kind in ("desk", "arc"):  # heavier, since they reach out
+            h = self.base_height * self.tall
+            return [parts.rounded_box((1.6 * r, 1.6 * r, 1.6 * h), (0, 0, 0.8 * h), 0.12 * h)]
         if self.base == "cube":
             return [parts.rounded_box((1.7 * r, 1.7 * r, 1.5 * h), (0, 0, 0.75 * h), 0.1 * h)]
         if self.base == "feet" and self.kind != "arc":
@@ -105,7 +108,7 @@ class Lamp(SimpleNamespace):
         start = np.array([0, rear, 0.7 * foot if self.base == "feet" else self.base_height * tall * 0.6])
         bend = np.array([0, rear + 0.3 * self.elbow * tall, (0.3 + 0.6 * self.elbow) * tall])
         end = np.array([0, -self.reach * 0.8 * tall, 0.86 * tall])
-        made = self._plinth_or_block()
+        made = self._plinth()
         if self.arm == "bent":
             corners = np.array([start, start + [0, 0.02, 0.6 * tall], (0, 0.5 * end[1], 1.12 * tall), end])
             made.append(parts.tube(parts.filleted(corners, 0.16 * tall, 8), 1.2 * g, up=(1, 0, 0)))
@@ -117,13 +120,6 @@ class Lamp(SimpleNamespace):
                 half = np.array([4.2 * g * share, 0, 0])
                 made.append(parts.bar(joint - half, joint + half, 2.2 * g))
         return [*made, self._hung_head(end, 0.6 * self.tilt)]
-
-    def _plinth_or_block(self) -> list[Manifold]:
-        """The base of a lamp that reaches out: a heavier block in place of the cube."""
-        if self.base != "cube":
-            return self._plinth()
-        r, h = self.foot, self.base_height * self.tall
-        return [parts.rounded_box((1.6 * r, 1.6 * r, 1.6 * h), (0, 0, 0.8 * h), 0.12 * h)]
 
     def _hung_head(self, end: np.ndarray, tilt: float) -> Manifold:
         """The head turned by `tilt` degrees about the end of an arm, where its rod enters."""
@@ -138,7 +134,7 @@ class Lamp(SimpleNamespace):
         drop = 0.1 + 0.16 * self.elbow
         rise = np.sin(0.5 * np.pi * t / (1 - drop))
         path = np.column_stack([0 * t, 0.42 * out - 1.25 * out * t**1.7, 0.02 + (0.97 * tall) * rise])
-        made = [base.translate((0, 0.42 * out, 0)) for base in self._plinth_or_block()]
+        made = [base.translate((0, 0.42 * out, 0)) for base in self._plinth()]
         return [*made, parts.tube(path, 1.25 * g, up=(1, 0, 0)), self._hung_head(path[-1], 0.4 * self.tilt)]
 
     def _tripod(self) -> list[Manifold]:

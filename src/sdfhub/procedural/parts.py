@@ -44,7 +44,7 @@ def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: in
     """A convex outline [N, 2] extruded with rounded rims; their radius is below half the outline's width."""
     r = min(radius, 0.49 * (top - bottom))
     if r <= 0:
-        return prism(outline, bottom, top)
+        return Manifold.extrude(CrossSection([outline]), top - bottom).translate((0, 0, bottom))
     centre = outline.mean(0)
     reach = np.linalg.norm(outline - centre, axis=1, keepdims=True)
     layers = []
@@ -53,11 +53,6 @@ def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: in
         for z in (top - r + r * np.sin(angle), bottom + r - r * np.sin(angle)):
             layers.append(level(inset, z))
     return Manifold.hull_points(np.vstack(layers))
-
-
-def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
-    """A polygon (convex or not, counter-clockwise) extruded from bottom to top."""
-    return Manifold.extrude(CrossSection([outline]), top - bottom).translate((0.0, 0.0, bottom))
 
 
 def loft(rings: Sequence | np.ndarray) -> Manifold:
@@ -208,10 +203,8 @@ def aprons(tops: Sequence[np.ndarray], height: float, thickness: float, tall: fl
 
 
 def stretchers(joints: Sequence[np.ndarray], style: str, board: Point, radii: Point | None) -> list[Manifold]:
-    """Bars between four legs: along the sides, and for "h" and "box" also across.
-
-    They are turned, with `radii` at their ends and in their middle, or boards of a thickness and a height.
-    """
+    """Bars between four legs: along the sides, and for "h" and "box" also across; turned with `radii` at
+    their ends and in their middle, or `board`s of a thickness and a height."""
     left, right, rear_left, rear_right = joints
     pairs = [(left, rear_left), (right, rear_right)]
     if style == "h":

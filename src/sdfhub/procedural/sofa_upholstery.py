@@ -128,7 +128,7 @@ def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps:
     points = np.column_stack([u * inner[0], v * inner[1], swell])
     rim = block.to_mesh64().vert_properties[:, :3]
     solid = Manifold.hull_points(np.ascontiguousarray(np.vstack([rim, points])))
-    return solid.rotate((lean, 0, 0)).translate(tuple(map(float, centre)))
+    return solid.rotate((lean, 0, 0)).translate(centre)
 
 
 def spans(sofa, count: int) -> list[tuple[float, float]]:
@@ -150,9 +150,9 @@ def seats(sofa) -> list[Manifold]:
         else:
             at = 0 if sofa.chaise == "left" else -1
             placed[at] = (*placed[at][:2], sofa.chaise_front)
-    made = []
+    made, rear = [], sofa.back_face + sofa.cushion_radius + 0.012
+    low = sofa.deck - 0.6 * sofa.cushion_radius
     for left, right, front in placed:
-        rear, low = sofa.back_face + sofa.cushion_radius + 0.012, sofa.deck - 0.6 * sofa.cushion_radius
         size = (right - left, rear - front, sofa.seat_height - low)
         centre = ((left + right) / 2, (front + rear) / 2, (low + sofa.seat_height) / 2)
         made.append(cushion(size, centre, sofa.cushion_radius, sofa.crown))
@@ -167,8 +167,7 @@ def loose(sofa) -> list[Manifold]:
     if sofa.pillows == "bolsters":
         return _bolsters(sofa, back)
     size = sofa.pillow_size
-    z = sofa.seat_height + 0.42 * size
-    x = sofa.half_seat - 0.55 * size - 0.02
+    x, z = sofa.half_seat - 0.55 * size - 0.02, sofa.seat_height + 0.42 * size
     if sofa.seats == 1:
         return [_pillow(size, (0, back - 0.1, z), 0.0)]
     first = _pillow(size, (x, back - 0.12, z), -18.0)
@@ -199,4 +198,4 @@ def _pillow(size: float, centre, yaw: float) -> Manifold:
         across = 0.5 * size * u * (0.92 + 0.08 * around**4)
         sections.append(np.column_stack([across, thick, height]))
     leaning = parts.loft(sections).rotate((-17, 0, 0)).rotate((0, 0, yaw))
-    return leaning.translate(tuple(map(float, centre)))
+    return leaning.translate(centre)

@@ -17,9 +17,8 @@ class Table(SimpleNamespace):
         edge_round=(0.0, 0.48), overhang=(0.02, 0.12), leg_width=(0.042, 0.085), leg_taper=(0.45, 0.95),
         leg_splay=(0.0, 0.1), apron_height=(0.05, 0.12), stretcher_height=(0.16, 0.34),
         foot_reach=(0.55, 0.8), top=["rectangle", "rectangle", "rounded", "boat", "oval", "round"],
-        base=[
-            "square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab", "loop",
-        ],
+        base=["square", "square", "turned", "round", "hairpin", "trestle", "cross", "pedestal", "slab",
+              "loop"],
         stretchers=["none", "none", "h", "box", "shelf"], apron=[True, False], drawers=[0, 0, 1, 2, 3],
         feet=[3, 4, 5],
     )  # fmt: skip
