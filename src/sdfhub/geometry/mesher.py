@@ -24,9 +24,7 @@ def mesh_fields(
     fields: Fields,
     shapes: int,
     resolution: int = 256,
-    coarse: int = 32,
     batch: int | None = None,
-    safety: float = 1.25,
     device: torch.device | str = "cpu",
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
@@ -39,9 +37,7 @@ def mesh_fields(
             repeated in any way) to signed distances [B, N], negative inside.
         shapes: how many.
         resolution: grid nodes per axis, >= 2.
-        coarse: cells per axis at the coarsest level, about: strides are powers of two.
         batch: points per call of `fields`; None chooses by device.
-        safety: factor on the measured slopes; larger misses less and evaluates more.
         device: where `fields` expects its points.
 
     Yields:
@@ -55,23 +51,16 @@ def mesh_fields(
     for first in range(0, shapes, together):
         group = range(first, min(first + together, shapes))
         grid = _grid(fields, group, resolution, batch, device)
-        cells, keys, values = evaluate_crossed_cells(grid, sample_blocks(grid, coarse, safety))
+        cells, keys, values = evaluate_crossed_cells(grid, sample_blocks(grid))
         of_cell, of_key = cells // nodes, keys // nodes
         for shape in range(len(group)):
             own, held, offset = cells[of_cell == shape], of_key == shape, shape * nodes
             yield grid.to_frame(*march_cells(own - offset, keys[held] - offset, values[held], resolution))
 
 
-def mesh_field(
-    field: Field,
-    resolution: int = 256,
-    coarse: int = 32,
-    batch: int | None = None,
-    safety: float = 1.25,
-    device: torch.device | str = "cpu",
-) -> Mesh:
+def mesh_field(field: Field, resolution: int = 256, device: torch.device | str = "cpu") -> Mesh:
     """The zero level of one field, which takes points [N, 3] alone: `mesh_fields` of one shape."""
-    return next(mesh_fields(_as_fields(field), 1, resolution, coarse, batch, safety, device))
+    return next(mesh_fields(_as_fields(field), 1, resolution, device=device))
 
 
 def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str = "cpu") -> Mesh:
@@ -89,17 +78,11 @@ def sdf_slice(
     resolution: int = 256,
     device: torch.device | str = "cpu",
 ) -> np.ndarray:
-    """The field on a plane across one axis.
-
-    Args:
-        field: as for `mesh_field`.
-        axis: 0, 1 or 2, the axis that the plane is perpendicular to.
-        offset: the plane's coordinate on that axis, normalised frame.
-        resolution: R, nodes per side; the outermost lie on the cube's faces.
-        device: where `field` expects its points.
+    """The field on a plane across `axis` (0, 1 or 2), `offset` from the origin, normalised frame.
 
     Returns:
-        [R, R] float32, one index for each of the two axes left, in their order, both ascending.
+        [resolution, resolution] float32, one index for each of the two axes left, in their order, both
+        ascending; the outermost nodes lie on the cube's faces.
     """
     grid = _grid(_as_fields(field), range(1), resolution, None, device)
     plane = torch.cartesian_prod(grid.axis, grid.axis)
