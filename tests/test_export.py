@@ -13,7 +13,7 @@ from PIL import Image
 
 import sdfhub
 from sdfhub.composition import instantiate
-from sdfhub.geometry.animation import animation
+from sdfhub.geometry.picture_file import animation
 from sdfhub.tasks.export import as_function, function_file
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
 from tests.tiny import composed, run_command

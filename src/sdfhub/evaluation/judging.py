@@ -4,6 +4,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -20,7 +21,7 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, pictured, write_reconstruction, write_scores
 from sdfhub.geometry.mesher import Mesh
-from sdfhub.geometry.metrics import Judge, ShapeMetrics
+from sdfhub.geometry.metrics import ShapeMetrics, judge_pair
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
@@ -149,7 +150,8 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
-    metrics = list(stream_in_processes(Judge(evaluation.points, evaluation.seed), pairs(), workers))
+    judge_one = partial(judge_pair, points=evaluation.points, seed=evaluation.seed)
+    metrics = list(stream_in_processes(judge_one, pairs(), workers))
     columns = zip(roles, cast(list[ShapeMetrics], metrics), pictures, strict=True)
     return [Judged(role, shape, row, drawn) for (role, shape, _), row, drawn in columns]
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh
 from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import STATISTICS, ShapeMetrics, summarize
+from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.geometry.render import render
 from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.shapes import NormalizedMesh

@@ -1,16 +1,16 @@
 """Which parts of a grid the zero level of a field can pass, from few evaluations, for many shapes at once.
 
 A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2, the finest thing that is skipped.
-Cells are rows [shape, i, j, k], sampled at their *centres*, s / 2 steps above the lowest corner. Slopes are per
-grid step.
+Cells are rows [shape, i, j, k], sampled at their *centres*, s / 2 steps above the lowest corner. Slopes are
+per grid step.
 
 A centre with the value f decides the sign of every node within |f| / L steps, where L bounds the slope of the
 field in the cell; a cell whose nodes are all decided is skipped. Of the blocks left, only nodes that no block
 decides are evaluated, and those of cells on which the sign changes. L is the steepest slope between samples
 around the cell, times SAFETY, and never below the slopes near the surface: networks trained with clamped
 distances may be steeper than 1 or nearly flat. Wherever a sign change leaves the blocks, the neighbour joins
-them, and when an inferred sign proves wrong, all are evaluated again. So a connected piece of surface is found
-whole or not at all.
+them, and when an inferred sign proves wrong, all are evaluated again. So a connected piece of surface is
+found whole or not at all.
 """
 
 from collections.abc import Sequence
@@ -68,8 +68,8 @@ def sample_blocks(grid: Grid) -> SampledCells:
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
-    Gives keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once and in no order;
-    and the values [K] float32.
+    Gives keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once and in no
+    order; and the values [K] float32.
     """
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
@@ -115,7 +115,7 @@ def _distance(offset: np.ndarray, n: int) -> int:
 
 
 def _node_keys(cells: np.ndarray, stride: int, steps: Sequence[int], n: int) -> np.ndarray:
-    """Keys [C, S, S, S] of nodes S steps along each axis above lowest corners, or of the grid's last nodes."""
+    """Keys [C, S, S, S] of nodes `steps` [S] above cells' lowest corners, or of the grid's last nodes."""
     shape, *ijk = cells.T
     offsets = np.array(steps, cells.dtype)
     i, j, k = (np.minimum(stride * index[:, None] + offsets, n - 1) for index in ijk)
@@ -169,9 +169,9 @@ def _evaluated_states(values: np.ndarray) -> np.ndarray:
 
 
 def _crossed_cells(outside: np.ndarray, nodes: np.ndarray, n: int) -> np.ndarray:
-    """[C, 2, 2, 2] whether the sign changes on cells of blocks with these nodes, `outside` or not [C, 3, 3, 3]."""
+    """[C, 2, 2, 2] whether the sign changes on the cells of blocks with these nodes, `outside` or not."""
     corners = np.stack([outside[:, i : i + 2, j : j + 2, k : k + 2] for i, j, k in np.ndindex(2, 2, 2)])
-    is_within = nodes[:, 1:, 1:, 1:] - nodes[:, :2, :2, :2] == n * n + n + 1  # not beyond the grid's last node
+    is_within = nodes[:, 1:, 1:, 1:] - nodes[:, :2, :2, :2] == n * n + n + 1  # no node comes twice
     return (corners.any(axis=0) != corners.all(axis=0)) & is_within
 
 

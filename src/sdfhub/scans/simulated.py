@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.render import seen_from
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.scans.evidence import Evidence
@@ -108,17 +107,9 @@ def view_scan(
 
     At most one of each of the picture's pixels * pixels; noise is the standard deviation along the rays.
     """
-    scene = EmbreeScene()
-    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-    forward = -sensor / np.linalg.norm(sensor)
-    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right = np.cross(-sensor, np.eye(3)[np.abs(sensor).argmin()])
     right /= np.linalg.norm(right)
-    steps = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * HALF_VIEW
-    x, y = np.meshgrid(steps, steps)
-    rays = forward + x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(right, forward)
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    origins = np.broadcast_to(sensor.astype(np.float32), rays.shape).copy()
-    hits = scene.run(origins, rays, query="INTERSECT", output=1)
+    _, rays, hits = seen_from(sensor, right, HALF_VIEW, pixels, mesh.vertices, mesh.faces)
     seen = hits["primID"] >= 0
     depth = hits["tfar"][seen] + noise * rng.standard_normal(seen.sum())
     return sensor + depth[:, None] * rays[seen].astype(np.float64)

@@ -6,9 +6,8 @@ from pathlib import Path
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.geometry.animation import animation
-from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh, write_row
+from sdfhub.geometry.picture_file import animation, contact_sheet
 from sdfhub.geometry.render import render
 from sdfhub.space import Space, reconstruct
 

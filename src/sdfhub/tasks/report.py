@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from sdfhub.data.store.store import Store, preparation_hash
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.opening import data_of
 from sdfhub.report.charts import charts
 from sdfhub.report.pictures import FindTruth, Sheet, contact_sheets, picture_uri, turning_meshes
