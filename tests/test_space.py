@@ -131,7 +131,7 @@ POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (64, 3))
     ("given", "message"),
     [
         ({"points": POINTS[:5]}, "5 points"),
-        ({"points": POINTS[:, :2]}, r"\[N, 3\]"),
+        ({"points": POINTS[:, :2]}, r"\[64, 3\]"),
         ({"points": POINTS, "sdf": np.zeros(4)}, r"\[64\] numbers, they are \[4\]"),
         ({"points": POINTS, "sdf": np.ones(64)}, "one side"),
         ({"points": POINTS * np.nan}, "not finite"),

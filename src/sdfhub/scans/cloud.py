@@ -6,10 +6,8 @@ from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
 NEIGHBOURS = 10  # points that a tangent plane is fitted to
-# points that noise is measured on: of more, neighbours would lie within the noise of each other
-ENOUGH = 8192
-# places from the flattest up that tell the noise, and what they show of it (chi of 7 degrees of freedom)
-QUIETEST, SHARE = 0.3, 0.817
+ENOUGH = 8192  # points that noise is measured on: of more, neighbours lie within the noise of each other
+QUIETEST, SHARE = 0.3, 0.817  # flattest places, and what they show of the noise (chi of 7 degrees of freedom)
 EDGE = 1.2  # half the edge of the cube in which the outside is flooded, normalised frame
 RAYS = 4  # rays nearest to a place that must all have passed it
 
@@ -22,8 +20,7 @@ def spacing_of(points: np.ndarray) -> float:
 def noise_of(points: np.ndarray) -> float:
     """Standard deviation of points [N, 3] across their surface, in their units.
 
-    How far neighbours scatter about their plane, at the flattest places: at edges and thin parts no plane
-    fits. A curved surface looks a little noisy.
+    How far neighbours scatter about their plane, at the flattest places. Curves look a little noisy.
     """
     _, scatter = tangent_planes(points[:: max(1, -(-len(points) // ENOUGH))])
     unbiased = np.sqrt(NEIGHBOURS / (NEIGHBOURS - 3))  # a plane takes three numbers
@@ -46,9 +43,10 @@ def grid_of(axis: np.ndarray) -> np.ndarray:
 def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> np.ndarray:
     """[Q] whether places `at` [Q, 3] can be reached from afar without coming near a cloud [N, 3].
 
-    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`; it comes in where the
-    cloud has gaps wider than twice that.
+    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`, or than half a cell's
+    diagonal, as thinner walls would let it through.
     """
+    reach = max(reach, 3**0.5 * EDGE / (cells - 1))
     nodes = grid_of(np.linspace(-EDGE, EDGE, cells))
     near = np.isfinite(cKDTree(points).query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
     pieces, _ = label(np.pad(~near, 1, constant_values=True))  # afar is free, though the corners may be near
@@ -56,42 +54,24 @@ def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> 
     return pieces[tuple(cell.T)] == pieces[0, 0, 0]
 
 
-def cell_radius(cells: int) -> float:
-    """Half the diagonal of a cell of the flood's cube, normalised frame: the least reach that stops it."""
-    return 3**0.5 * EDGE / (cells - 1)
+def winding(points: np.ndarray, normals: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """[Q] winding numbers of an oriented cloud [N, 3] about the points `at` [Q, 3]: near 1 inside, 0 outside.
 
-
-def winding(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """[Q] winding numbers of an oriented cloud about the points `at` [Q, 3]: near 1 inside, 0 outside.
-
-    Source: Barill et al. 2018, with the areas [N] that points stand for.
+    Source: Barill et al. 2018; a point stands for a disc up to its neighbours, shared with them.
     """
-    return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
-
-
-def areas_of(points: np.ndarray) -> np.ndarray:
-    """[N] the area that each point stands for: a disc up to its neighbours, shared with them."""
     distance = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[0]
-    return np.pi * distance[:, -1] ** 2 / (distance.shape[1] - 1)
+    areas = np.pi * distance[:, -1] ** 2 / (distance.shape[1] - 1)
+    return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
 
 
 def free_space(
     points: np.ndarray, sensor: np.ndarray, cells: int, background: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places that a sensor saw to be empty, and how far at least they are from any surface.
+    """Cells of [-1, 1]^3 that a sensor [3] whose rays ended at points [N, 3] saw to be empty.
 
-    A cell of the cube is free if the rays nearest to it, no further apart than rays are from each other,
-    ended a cell behind it. Its distance to the nearest cell that is not free bounds that to any surface,
-    seen or unseen.
-
-    Args:
-        points: [N, 3] where rays ended, normalised frame.
-        sensor: [3] where they began.
-        cells: along an axis of [-1, 1]^3.
-        background: whether what no ray ended near is empty all along.
-
-    Returns:
-        centres [K, 3] of free cells and lower bounds [K] of the distance there, >= 0.
+    A cell is free if the rays nearest to it, no further apart than rays are from each other, ended a cell
+    behind it; with `background` also where no ray ended near. Its distance to the nearest cell that is not
+    free bounds that to any surface, seen or unseen: centres [K, 3], and lower bounds [K] >= 0 there.
     """
     size = 2 / cells
     centres = grid_of(-1 + size * (np.arange(cells) + 0.5))

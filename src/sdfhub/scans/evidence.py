@@ -64,11 +64,11 @@ class Evidence:
     ) -> Observation:
         """From points [M, 3] all over a closed surface, normalised frame, with normals [M, 3] or without.
 
-        The distance of a place is at most that to the nearest point, and at least that to tangent planes
-        there or what the gaps between points leave. With normals the winding number tells its sign; without
-        them it is known only where one comes from outside without meeting the cloud.
+        A place is at most as far as the nearest point, and at least as far as tangent planes there or what
+        the gaps between points leave. With normals the winding number tells its side; without them it is
+        known only where one comes from outside without meeting the cloud.
         """
-        noise, spacing = self._noise_in(points), cloud.spacing_of(points)
+        noise, spacing = self._noise_and_spacing(points)
         _, uniform, near = self._counts()
         deviation = np.sqrt(self.variances)[np.arange(near) % len(self.variances), None]
         at = points[rng.integers(len(points), size=near)] + deviation * rng.standard_normal((near, 3))
@@ -78,14 +78,12 @@ class Evidence:
         # the nearest of many scattered points lies nearer than the surface
         least = np.sqrt(np.maximum(np.maximum(distance - noise, 0) ** 2 - (GAPS * spacing) ** 2, 0))
         if normals is None:
-            # a wall thinner than the flood's own cells would let it through
-            reach = max(SEALED * spacing, 3 * noise, cloud.cell_radius(self.cells))
-            outside = cloud.is_outside(points, at, reach, self.cells)
+            outside = cloud.is_outside(points, at, max(SEALED * spacing, 3 * noise), self.cells)
             inside = np.zeros_like(outside)
         else:
             apart = np.einsum("ijk,ijk->ij", at[:, None] - points[nearest], normals[nearest])
             least = np.maximum(least, np.abs(apart).min(axis=1) - 2 * noise)
-            turns = cloud.winding(points, normals, cloud.areas_of(points), at)
+            turns = cloud.winding(points, normals, at)
             outside, inside = turns < 0.5 - self.certain, turns > 0.5 + self.certain
         most, unsigned = distance + 3 * noise, ~outside & ~inside
         low = np.where(outside | unsigned, least, -most)
@@ -96,11 +94,10 @@ class Evidence:
     ) -> Observation:
         """From points [M, 3] that one sensor at `sensor` [3] saw, with normals [M, 3] or without.
 
-        Free space is at least as far from any surface as from space not known to be free, and nothing is
-        further from the surface than from the nearest seen point. Beside the seen points, the side of the
-        sensor is outside.
+        Free space is at least as far from any surface as from space not known to be free, and at most as far
+        as from the nearest seen point. Beside the seen points, the side of the sensor is outside.
         """
-        noise, spacing, tree = self._noise_in(points), cloud.spacing_of(points), cKDTree(points)
+        (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
         beside, steps = self._beside(points, normals, sensor, max(2 * spacing, 3 * noise), tree, rng)
         slack = np.where(steps > 0, noise, np.abs(steps))  # the part may be thin behind its face
         empty, clear = cloud.free_space(points, sensor, self.cells, self.background)
@@ -115,7 +112,7 @@ class Evidence:
     def _beside(self, points, normals, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
         """Places [Q, 3] a step before and behind seen points, and the signed steps [Q].
 
-        Where normals are not given, only the flatter half of the surface has such that can be trusted.
+        Without given normals, only the flatter half of the surface has such that can be trusted.
         """
         flat = np.arange(len(points))
         if normals is None:
@@ -129,10 +126,10 @@ class Evidence:
         own = rng.choice(own, self._counts()[2]) if len(own) else own
         return beside[own], steps[own]
 
-    def _noise_in(self, points: np.ndarray) -> float:
-        """The noise of points [M, 3], normalised frame, or 0 where there is hardly any."""
+    def _noise_and_spacing(self, points: np.ndarray) -> tuple[float, float]:
+        """Of points [M, 3], normalised frame; no noise where there is hardly any."""
         noise = cloud.noise_of(points)
-        return noise if noise > self.quiet else 0.0
+        return (noise if noise > self.quiet else 0.0), cloud.spacing_of(points)
 
     def _counts(self) -> tuple[int, int, int]:
         """How many rows lie on the surface, anywhere, and near the surface."""
