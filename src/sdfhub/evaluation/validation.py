@@ -44,17 +44,11 @@ class Validation:
     seed: NonNegativeInt = 0
 
     def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
-        """The scores of one shape.
+        """The scores of one shape, from a decoder in evaluation mode and codes [S, L].
 
-        Args:
-            decoder: in evaluation mode.
-            item: the shape.
-            codes: [S, L] code table.
-
-        Returns:
-            `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units. `cd`: Chamfer distance
-            times 10^3, squared normalised units, where the shape has a mesh. A reconstruction without surface
-            counts as one point at the origin, far worse than any other, so that monitors have a number.
+        `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units. `cd`: Chamfer distance
+        times 10^3, squared normalised units, where the shape has a mesh. A reconstruction without surface
+        counts as one point at the origin, far worse than any other, so that monitors have a number.
         """
         rows = signed_samples(item.shape, self.fit.samples or self.points, np.random.default_rng(self.seed))
         with torch.inference_mode(False), torch.no_grad():  # fits need derivatives
