@@ -9,7 +9,6 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.mesher import Mesh
 from sdfhub.latent.fitting import Fit, Fitted
 from sdfhub.latent.similarity import PoseRange
 from sdfhub.reconstruction.result import Limits, Result
@@ -17,39 +16,23 @@ from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, ScanFrame, observe
 from sdfhub.scans.scan import read_scan
 from sdfhub.scans.simulated import ScanKind
+from sdfhub.shapes import Mesh
 from sdfhub.space import Space
 
 
 @dataclass(frozen=True)
 class Reconstructor:
-    """A trained space and how scans are fitted in it.
-
-    Args:
-        space: where codes are looked for.
-        fit: finds codes and poses.
-        evidence: makes observations of scans.
-        frame: of the scans.
-        poses: how far the scans' frames may be off; None where they are known.
-        resolution: points along an axis of the marching-cubes grid, >= 2.
-    """
+    """A trained space and how scans are fitted in it."""
 
     space: Space
     fit: Fit
     evidence: Evidence
     frame: ScanFrame
-    poses: PoseRange | None
-    resolution: int
+    poses: PoseRange | None  # how far the scans' frames may be off; None where they are known
+    resolution: int  # points along an axis of the marching-cubes grid, >= 2
 
     def read(self, path: Path, sensor: Sequence[float] | None) -> ObservedScan:
-        """The scan in a file, observed; the same file gives the same observation.
-
-        Args:
-            path: of a scan.
-            sensor: [3] from where a cloud was seen that does not say so itself, in its frame, or None.
-
-        Raises:
-            SdfhubError: names the file.
-        """
+        """The scan in a file, observed; `sensor` [3] is where a cloud was seen from that does not say so."""
         scan = read_scan(path)
         if sensor is not None and scan.kind in ("bare", "oriented"):
             scan = replace(scan, sensor=np.array(sensor, dtype=np.float64))
@@ -79,15 +62,9 @@ class Reconstructor:
     def reconstruct(
         self, scans: Mapping[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path, together: int
     ) -> Iterator[Result]:
-        """Fits and meshes scans by name and writes NAME.ply and NAME.json of each, as they are found.
+        """Fits and meshes scans by name, `together` side by side, and writes NAME.ply and NAME.json of each.
 
         One that fails does not stop the others.
-
-        Args:
-            scans: by the names of their files.
-            limits: by kind of scan.
-            out: folder.
-            together: scans fitted side by side.
         """
         names = list(scans)
         for first in range(0, len(names), together):
@@ -105,22 +82,20 @@ class Reconstructor:
     ) -> list[Result]:
         scans, results = list(group.values()), []
         fitted = self.fitted(scans)
-        doubts = self.doubts(fitted).tolist()
-        near = [True] * len(group)
-        if self.poses and fitted.poses:
-            near = self.poses.holds(fitted.poses).tolist()
+        doubts = self.doubts(fitted)
+        near = self.poses.holds(fitted.poses) if self.poses and fitted.poses else [True] * len(group)
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
             result = Result(
                 name,
                 kind=str(kind),
                 residual=float(fitted.residuals[row]),
-                doubt=doubts[row],
+                doubt=float(doubts[row]),
                 code=tuple(fitted.codes[row].tolist()),
                 frame=tuple(map(tuple, matrix.tolist())),
-                mesh=f"{name}.ply" if len(mesh[1]) else None,
+                mesh=f"{name}.ply" if len(mesh.faces) else None,
             )
-            results.append(result.judged(limits.get(kind), near[row]))
+            results.append(result.judged(limits.get(kind), bool(near[row])))
             write_mesh(*mesh, out / f"{name}.ply")
             results[-1].write(out)  # last: a result is whole when it is described
         return results

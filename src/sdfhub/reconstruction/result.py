@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from tabulate import tabulate
+
 from sdfhub.whole_file import write_whole
 
 Verdict = Literal["fitted", "doubtful", "unjudged", "failed"]
@@ -21,31 +23,18 @@ class Limits:
 
 @dataclass(frozen=True)
 class Result:
-    """The reconstruction of one scan.
+    """The reconstruction of one scan."""
 
-    Args:
-        name: of its files.
-        kind: what it was judged as; empty where it failed.
-        residual: mean violation of the scan's bounds, normalised units.
-        doubt: the same times the fourth power of one plus how unusual its code is.
-        limits: what these two may be at most; None where nothing was calibrated.
-        verdict: fitted, doubtful, unjudged (not calibrated) or failed.
-        reason: of a verdict other than fitted.
-        code: [L] numbers.
-        frame: rows [4][4] of the matrix from the normalised frame to the scan's.
-        mesh: file name; None without a surface.
-    """
-
-    name: str
-    kind: str = ""
-    residual: float | None = None
-    doubt: float | None = None
-    limits: Limits | None = None
+    name: str  # of its files
+    kind: str = ""  # what it was judged as; empty where it failed
+    residual: float | None = None  # mean violation of the scan's bounds, normalised units
+    doubt: float | None = None  # the same times the fourth power of one plus how unusual its code is
+    limits: Limits | None = None  # what these two may be at most; None where nothing was calibrated
     verdict: Verdict = "failed"
-    reason: str = ""
-    code: tuple[float, ...] = ()
-    frame: tuple[tuple[float, ...], ...] = ()
-    mesh: str | None = None
+    reason: str = ""  # of a verdict other than fitted
+    code: tuple[float, ...] = ()  # [L]
+    frame: tuple[tuple[float, ...], ...] = ()  # matrix [4][4] from the normalised frame to the scan's
+    mesh: str | None = None  # file name; None without a surface
 
     def judged(self, limits: Limits | None, is_near: bool) -> "Result":
         """The same with a verdict; `is_near` tells whether its pose lies within the range of poses."""
@@ -78,15 +67,11 @@ def is_result(path: Path) -> bool:
 
 def table(results: Sequence[Result]) -> str:
     """A line a scan: verdict, residual and doubt beside their limits, times 10^3, what it was judged as."""
-    width = max(len("scan"), *(len(result.name) for result in results)) + 2
-    lines = [
-        f"{'scan':<{width}}{'verdict':<10}{'residual':>10}{'at most':>9}{'doubt':>11}{'at most':>11}  "
-        "judged as (numbers times 10^3)"
-    ]
+    lines = [["scan", "verdict", "residual x10^3", "limit", "doubt x10^3", "limit", "judged as"]]
     for result in results:
-        residual, doubt = (result.limits.residual, result.limits.doubt) if result.limits else (None, None)
-        numbers = (result.residual, 10), (residual, 9), (result.doubt, 11), (doubt, 11)
-        cells = [f"{'' if value is None else format(value * 1e3, '.3f'):>{size}}" for value, size in numbers]
+        limits = asdict(result.limits) if result.limits else {}
+        numbers = result.residual, limits.get("residual"), result.doubt, limits.get("doubt")
+        cells = [f"{1e3 * value:.3f}" if value is not None else "" for value in numbers]
         reason = f"; {result.reason}" if result.reason and result.verdict != "failed" else ""
-        lines.append(f"{result.name:<{width}}{result.verdict:<10}{''.join(cells)}  {result.kind}{reason}")
-    return "\n".join(lines)
+        lines.append([result.name, result.verdict, *cells, result.kind + reason])
+    return tabulate(lines, headers="firstrow", disable_numparse=True)
