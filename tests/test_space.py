@@ -406,7 +406,7 @@ def test_a_strangers_run_folder_runs_no_code(run, tmp_path):
 
 def test_points_of_other_shapes_than_the_codes_are_refused_and_none_give_none(space):
     for shapes in (1, 3):
-        with pytest.raises(SdfhubError, match=f"points of {shapes} shapes, but codes of 2"):
+        with pytest.raises(SdfhubError, match=rf"of B shapes, got points \[{shapes}, 5, 3\]"):
             space.sdf(torch.zeros(shapes, 5, 3), space.codes[:2])
     assert space.sdf(torch.zeros(2, 0, 3), space.codes[:2]).shape == (2, 0)
     assert space.sdf(torch.zeros(0, 3), space.codes[0]).shape == (0,)

@@ -127,15 +127,13 @@ class Space:
         Points are in the normalised frame. Differentiable by points and codes, as often as the decoder is.
         """
         points, codes = self._tensor(points), self.code(shape)
-        is_one = points.dim() == 2
-        if points.shape[-1:] != (3,) or points.dim() != codes.dim() + 1:
+        if points.dim() < 2 or points.shape != (*codes.shape[:-1], points.shape[-2], 3):
             what = f"points {list(points.shape)} and codes {list(codes.shape)}"
             raise SdfhubError(f"sdf takes points [N, 3] of one shape or [B, N, 3] of B shapes, got {what}")
-        points, codes = (points[None], codes[None]) if is_one else (points, codes)
-        if len(points) != len(codes):
-            raise SdfhubError(f"sdf: points of {len(points)} shapes, but codes of {len(codes)}")
         if not points.numel():
-            return points.new_zeros(points.shape[1:-1] if is_one else points.shape[:-1])
+            return points.new_zeros(points.shape[:-1])
+        is_one = points.dim() == 2
+        points, codes = (points[None], codes[None]) if is_one else (points, codes)
         differentiated = torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)
         sdf = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
         return sdf[0] if is_one else sdf

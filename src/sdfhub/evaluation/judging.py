@@ -43,29 +43,17 @@ Role = tuple[str, StoredShape, Tensor]
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
 class Evaluation:
-    """How a shape space is judged.
+    """How a shape space is judged."""
 
-    Args:
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side for Chamfer distance and F-score.
-        train: training shapes to judge, from the front of the code table; None judges all.
-        held_out: held-out shapes to judge; None judges all.
-        fit: how codes of held-out shapes are found.
-        fit_together: held-out shapes fitted side by side.
-        pictures: shapes of each role on the contact sheet.
-        workers: processes that judge; None for one per core.
-        seed: of every draw.
-    """
-
-    resolution: Annotated[int, Field(ge=2)]
-    points: PositiveInt
-    train: NonNegativeInt | None
-    held_out: NonNegativeInt | None
-    fit: SkipValidation[Fit]
-    fit_together: PositiveInt
-    pictures: NonNegativeInt
-    workers: NonNegativeInt | None = None
-    seed: NonNegativeInt = 0
+    resolution: Annotated[int, Field(ge=2)]  # points along an axis of the marching-cubes grid
+    points: PositiveInt  # surface points a side for Chamfer distance and F-score
+    train: NonNegativeInt | None  # training shapes to judge, from the front of the code table; None: all
+    held_out: NonNegativeInt | None  # held-out shapes to judge; None: all
+    fit: SkipValidation[Fit]  # how codes of held-out shapes are found
+    fit_together: PositiveInt  # held-out shapes fitted side by side
+    pictures: NonNegativeInt  # shapes of each role on the contact sheet
+    workers: NonNegativeInt | None = None  # processes that judge; None: one per core
+    seed: NonNegativeInt = 0  # of every draw
 
 
 def evaluate_model(
@@ -80,17 +68,9 @@ def evaluate_model(
 ) -> dict[str, Any]:
     """Judges training and held-out shapes; writes tables, meshes and pictures below `out`.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by their signed distances alone.
-
-    Args:
-        decoder: trained.
-        codes: [S, L] code table.
-        delta: clamp of distances that the decoder was trained with; codes are fitted under the same.
-        train: shapes that it was trained on, by row of the table.
-        held_out: shapes that it has not seen.
-        evaluation: how to judge.
-        out: folder of the results.
-        training: plain numbers about the training, to be kept beside the scores, which are returned too.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Training shapes are
+    named by their rows of the codes [S, L]; codes of others are fitted under the training's clamp `delta`.
+    Returned is what `metrics.json` holds, plain numbers about the training included.
     """
     decoder.eval()
     roles: list[Role]

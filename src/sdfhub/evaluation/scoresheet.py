@@ -4,6 +4,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -53,14 +54,8 @@ def write_scores(
 ) -> dict[str, Any]:
     """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
 
-    Args:
-        judged: what was judged, in the order of the table.
-        evaluation: a dataclass of the settings, kept beside the numbers.
-        training: plain numbers about the training, likewise; None where nothing was trained.
-        out: folder of the results.
-
-    Returns:
-        What `metrics.json` holds: the settings and, per role, a `summary` and the rows of its `shapes`.
+    Returns what `metrics.json` holds: the settings (a dataclass), plain numbers about the training and, per
+    role, a `summary` and the rows of its `shapes`, in the order in which they were judged.
     """
     import pandas  # here: slow to import, and every training would wait for it before its first step
 
@@ -74,8 +69,10 @@ def write_scores(
     if any(isinstance(row.metrics, DistanceMetrics) for row in judged):
         log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     if pictures := [row.pictures for row in judged if row.pictures]:
-        captions = [f"{row.shape.id}\n{_title(row)}" for row in judged if row.pictures]
-        labels = ["ground truth", "reconstruction"]
+        captions, labels = (
+            [_caption(row) for row in judged if row.pictures],
+            ["ground truth", "reconstruction"],
+        )
         contact_sheet(list(zip(*pictures, strict=True)), labels, captions, out / "contact_sheet.png")
     # last: a run that has it is finished
     write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
@@ -113,10 +110,9 @@ def table(judged: Sequence[Judged]) -> str:
 
 
 def _by_role(judged: Sequence[Judged]) -> dict[str, list[Judged]]:
-    roles = dict.fromkeys(row.role for row in judged)
-    return {role: [row for row in judged if row.role == role] for role in roles}
+    return {role: list(rows) for role, rows in groupby(judged, lambda row: row.role)}
 
 
-def _title(row: Judged) -> str:
-    cd = None if isinstance(row.metrics, DistanceMetrics) else row.metrics.cd
-    return f"{row.role.replace('_', '-')}, {'no surface' if cd is None else f'CD {cd * 1e3:.3f}'}"
+def _caption(row: Judged) -> str:
+    cd = getattr(row.metrics, "cd", None)
+    return f"{row.shape.id}\n{row.role}, {'no surface' if cd is None else f'CD {cd * 1e3:.3f}'}"

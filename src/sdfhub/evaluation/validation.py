@@ -28,20 +28,13 @@ class Validation:
 
     It is coarse, to cost little: good for comparing states of one training, not for tables. The same samples
     are drawn every time. It changes neither weights nor random states of a training.
-
-    Args:
-        fit: finds the codes of held-out shapes.
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side of the Chamfer distance.
-        delta: clamp of distances in the training, normalised frame.
-        seed: of all samples.
     """
 
-    fit: SkipValidation[Fit]
-    resolution: Annotated[int, Field(ge=2)] = 64
-    points: PositiveInt = 10_000
-    delta: PositiveFloat = 0.1
-    seed: NonNegativeInt = 0
+    fit: SkipValidation[Fit]  # finds the codes of held-out shapes
+    resolution: Annotated[int, Field(ge=2)] = 64  # points along an axis of the marching-cubes grid
+    points: PositiveInt = 10_000  # surface points a side of the Chamfer distance
+    delta: PositiveFloat = 0.1  # clamp of distances in the training, normalised frame
+    seed: NonNegativeInt = 0  # of all samples
 
     def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
         """The scores of one shape, from a decoder in evaluation mode and codes [S, L].

@@ -17,8 +17,7 @@ from sdfhub.shapes import Mesh
 Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """Maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 to signed distances [B, N]."""
 
-# points of one shape in a row of a call: shapes need unequal numbers of points, and share calls in tiles
-TILE = 1024
+TILE = 1024  # points of a shape in a row of a call: shapes need unequal numbers of them, and share calls
 
 
 @dataclass(frozen=True)

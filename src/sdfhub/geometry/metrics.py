@@ -57,14 +57,9 @@ class ShapeMetrics:
 def judge(
     reconstruction: Mesh, truth: NormalizedMesh, points: int = 30_000, seed: int = 0, tau: float = 0.01
 ) -> ShapeMetrics:
-    """All metrics of a reconstruction against the true mesh.
+    """All metrics of a reconstruction, normalised frame, against the true mesh, from `points` samples a side.
 
-    Args:
-        reconstruction: vertices [V, 3] and faces [F, 3], normalised frame; F = 0 is a failure.
-        truth: the mesh it should equal.
-        points: samples on each side.
-        seed: of all samples; the same seed gives the same judgement.
-        tau: threshold of the F-score, normalised frame.
+    The same seed gives the same judgement; tau is the threshold of the F-score, normalised frame.
     """
     mesh = Mesh(*map(np.ascontiguousarray, reconstruction, (np.float64, np.int64)))
     true_mesh = Mesh(truth.vertices, truth.faces)
@@ -111,12 +106,9 @@ def judge_pair(pair: tuple[Mesh, NormalizedMesh], points: int, seed: int) -> Sha
 
 
 def chamfer(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean squared nearest distance from a to b plus that from b to a.
+    """Mean squared nearest distance from points a [N, 3] to b [M, 3] plus that from b to a.
 
     Source: Fan et al., A Point Set Generation Network, 2017, with means for sums.
-
-    Args:
-        a, b: [N, 3] and [M, 3], N and M > 0, in the same frame.
     """
     return float(np.mean(_nearest(a, b)[0] ** 2) + np.mean(_nearest(b, a)[0] ** 2))
 
@@ -158,10 +150,7 @@ def _edges_cancel(faces: np.ndarray) -> bool:
 def summarize(rows: Sequence[ShapeMetrics]) -> dict[str, Any]:
     """Mean, median and 90th percentile of every metric over a set of shapes, failures counted beside them.
 
-    Returns:
-        `shapes`, `failed`, `failures` (how failures enter, in words), `cd_mean_with_failures` and
-        `cd_median_with_failures`, and per metric `mean`, `median` and `p90`, None where no shape has it, and
-        `count`, the number of shapes that have it.
+    `count` is the number of shapes that have a metric; its statistics are None where there is none.
     """
     with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
     summary = {"shapes": len(rows), "failed": sum(row.failed for row in rows), "failures": FAILURES}

@@ -16,13 +16,9 @@ _GAP = 4  # white between pictures, pixels
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray | str]], row_labels: Sequence[str], captions: Sequence[str], path: Path
 ) -> Path:
-    """Lays pictures out as a grid, writes it as one PNG, whole or not at all, and returns its path.
+    """Writes pictures of one size as a grid, one PNG; a text, such as "no surface", stands for a missing one.
 
-    Args:
-        rows: pictures [S, S, 3] uint8 of one size; a text, such as "no surface", fills a tile.
-        row_labels: one text per row; [] for none.
-        captions: one text per column, or one per picture, of one or two lines; [] for none.
-        path: where the PNG goes; its folder is made.
+    Row labels and captions may be left out; captions are one text per column, or one per picture.
     """
     size = next((len(image) for row in rows for image in row if not isinstance(image, str)), 256)
     columns, font_size = max(map(len, rows), default=0), max(11, size // 14)

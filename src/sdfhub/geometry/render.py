@@ -28,19 +28,15 @@ def render(
     elevation: float = 24.0,
     background: float = 1.0,
 ) -> np.ndarray:
-    """A shaded picture of a mesh from a three-quarter view; both sides of its faces are lit.
+    """A shaded picture [size, size, 3] uint8 of a mesh from a three-quarter view, lit on both sides.
 
     Args:
-        vertices: [V, 3], within the unit ball.
-        faces: [F, 3] rows of `vertices`; F = 0 gives the background.
+        vertices, faces: [V, 3], within the unit ball, and [F, 3]; F = 0 gives the background.
         size: width and height in pixels.
         up: the axis of the mesh that points up; with "y" its front looks along +z, as is usual there.
         azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
         elevation: height of the camera above the horizon in degrees.
         background: sRGB grey level around the shape, in [0, 1].
-
-    Returns:
-        [size, size, 3] uint8, sRGB.
     """
     image = np.full((2 * size * 2 * size, 3), background**2.2)
     faces = np.asarray(faces)
@@ -61,14 +57,9 @@ def render(
 
 
 def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
-    """A signed distance slice in colour: blue inside, orange outside, a line every delta / 4, zero black.
+    """A slice [R, R] of signed distances in colour [R, R, 3] uint8: blue inside, orange outside, zero black.
 
-    Args:
-        sdf_grid: [R, R], negative inside; the first index runs right, the second up.
-        delta: distance at which the colour saturates, > 0.
-
-    Returns:
-        [R, R, 3] uint8, sRGB.
+    Colours saturate at delta; there is a line every delta / 4. The first index runs right, the second up.
     """
     sdf = np.asarray(sdf_grid, dtype=np.float64).T[::-1]
     amount = np.clip(np.abs(sdf) / delta, 0, 1)[..., None]

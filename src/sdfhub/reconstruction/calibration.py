@@ -33,17 +33,11 @@ RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
 
 @dataclass(frozen=True)
 class Calibration:
-    """How limits are found.
+    """How limits are found."""
 
-    Args:
-        shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
-        spread: standard deviations that a value's logarithm may lie above the mean of theirs.
-        reach: times the largest of theirs, however far theirs spread.
-    """
-
-    shapes: NonNegativeInt
-    spread: PositiveFloat
-    reach: PositiveFloat
+    shapes: NonNegativeInt  # unseen shapes to fit, >= 3; 0 for no verdicts
+    spread: PositiveFloat  # standard deviations that a value's logarithm may lie above the mean of theirs
+    reach: PositiveFloat  # times the largest of theirs, however far theirs spread
 
     def __post_init__(self):
         if 0 < self.shapes < 3:

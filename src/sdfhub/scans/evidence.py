@@ -24,28 +24,18 @@ class Evidence:
     """How an observation is made of a scan.
 
     Source: the jitter of points near the surface is DeepSDF's (its published code).
-
-    Args:
-        rows: N, bounded points of an observation.
-        samples: the same of signed samples: as many as `evaluate` fits.
-        surface: share of them on the surface.
-        uniform: share of them anywhere in the cube, or in the space a sensor saw to be empty.
-        variances: squared standard deviations of the jitter of the others, normalised units squared.
-        cells: along an axis of the grid of empty space.
-        certain: a sign counts where the winding number is this far from 1/2.
-        background: whether a sensor's rays beside those that met something crossed empty space.
-        quiet: noise below this is none, normalised frame: a smooth surface's curvature looks like it.
     """
 
-    rows: Annotated[int, Field(ge=4)] = 8192
-    samples: Annotated[int, Field(ge=4)] = 16384
-    surface: Share = 0.25
-    uniform: Share = 0.15
+    rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
+    samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
+    surface: Share = 0.25  # of them on the surface
+    uniform: Share = 0.15  # of them anywhere in the cube, or in the space a sensor saw to be empty
+    # squared standard deviations of the jitter of the others, normalised units squared
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
-    cells: Annotated[int, Field(ge=8)] = 64
-    certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2
-    background: bool = False
-    quiet: NonNegativeFloat = 0.003
+    cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
+    certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
+    background: bool = False  # whether a sensor's rays beside those that met something crossed empty space
+    quiet: NonNegativeFloat = 0.003  # noise below this is none: a smooth surface's curvature looks like it
 
     def __post_init__(self):
         if self.surface + self.uniform > 1:

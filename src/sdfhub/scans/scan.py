@@ -17,7 +17,6 @@ from sdfhub.shapes import Frame
 FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
 LEAST = 50  # points from which a shape may be guessed
 _PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
-_FACES = re.compile(rb"^element\s+(?:face|tristrips)\s+[1-9]", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,8 @@ def read_scan(path: str | Path) -> Scan:
     try:
         if suffix == ".npz":
             return _archive(path)
-        if suffix in (".xyz", ".npy") or (suffix == ".ply" and not _FACES.search(_head(path))):
-            return _cloud({".xyz": _text_rows, ".npy": _array_rows, ".ply": _ply_rows}[suffix](path))
+        if suffix in (".xyz", ".npy") or (suffix == ".ply" and not _has_faces(path)):
+            return _cloud({".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}[suffix](path))
         vertices, faces = read_mesh(path)
         return Scan(vertices, faces=faces)
     except RejectedMesh as rejection:
@@ -97,19 +96,13 @@ def _cloud(rows: np.ndarray) -> Scan:
     return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
 
 
-def _text_rows(path: Path) -> np.ndarray:
-    return np.loadtxt(path, ndmin=2)
-
-
 def _array_rows(path: Path) -> np.ndarray:
-    rows = np.load(path, mmap_mode="r", allow_pickle=False)  # a header that claims more than the file fails
-    if rows.dtype.kind != "f":
-        raise ValueError(f"expected floating-point numbers, got {rows.dtype}")
-    return rows
+    return np.load(path, mmap_mode="r", allow_pickle=False)  # a header that claims more than the file fails
 
 
-def _head(path: Path) -> bytes:
-    return path.read_bytes().partition(b"end_header")[0]
+def _has_faces(path: Path) -> bool:
+    header = path.read_bytes().partition(b"end_header")[0]
+    return bool(re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE))
 
 
 def _ply_rows(path: Path) -> np.ndarray:
