@@ -26,7 +26,7 @@ from sdfhub.opening import data_of
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate
-from tests.tiny import build_autodecoder, composed, read_weights
+from tests.tiny import STORE, build_autodecoder, composed, read_weights, run_command
 
 ROOT = Path(__file__).parents[1]
 OPEN = ROOT / "data" / "open"
@@ -40,8 +40,12 @@ TINY = [
     "normals.points=32",
     "evaluate.resolution=48",
     "evaluate.points=2000",
+    "evaluate.pictures=1",
     "fit.steps=20",
     "fit.samples=500",
+    "validation.resolution=24",
+    "validation.points=500",
+    "validation.fit.samples=500",
 ]
 
 
@@ -72,9 +76,12 @@ def trained(tmp_path_factory) -> tuple[Path, str]:
         "data.held_out=1",
         "trainer.max_epochs=6",
         "callbacks.mesh.times=5",
+        "callbacks.mesh.resolution=24",
+        "callbacks.mesh.points=500",
+        "callbacks.slices.times=2",
+        "trainer.check_val_every_n_epoch=3",
         "logger=many",
-        "callbacks.mesh.resolution=32",
-        f"data.store={root / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={root / 'outputs'}",
     )
     return only_run(root / "outputs"), done.stdout
@@ -162,19 +169,14 @@ def test_validation_is_logged(trained):
         assert values and np.isfinite(values).all(), key
 
 
-def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(trained):
+def test_a_finished_run_is_judged_again_at_another_resolution_and_on_other_shapes(
+    trained, monkeypatch, capsys
+):
     folder, _ = trained
-    done = run(
-        ["-m", "sdfhub", "evaluate"],
-        f"run={folder}",
-        "evaluate=fast",
-        "evaluate.resolution=40",
-        "evaluate.points=2000",
-        "fit.steps=10",
-        "held_out=2",
-        "data.store=" + str(folder.parents[2] / "store"),
-    )
-    assert "held-out shapes" in done.stdout
+    words = ["evaluate=fast", "evaluate.resolution=40", "evaluate.points=2000", "evaluate.pictures=1"]
+    words += ["fit.steps=10", "fit.samples=500", "held_out=2", f"data.store={STORE}"]
+    assert run_command(monkeypatch, str(folder), *words, task="evaluate") == 0
+    assert "held-out shapes" in capsys.readouterr().out
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["evaluation"]["resolution"] == 40
     assert len(metrics["held_out"]["shapes"]) == 2
@@ -234,7 +236,7 @@ def test_evaluate_without_a_run_says_so(tmp_path):
         evaluate(composed("run=" + str(tmp_path), config_name="evaluate"))
 
 
-def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
+def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path, monkeypatch, capsys):
     """Bit for bit on the CPU, with dropout, and with another number of loader processes."""
     common = [
         *TINY,
@@ -243,14 +245,15 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
         "decoder.dropout=0.1",
         "data.loader.passes_per_epoch=4",
         "data.loader.shapes_per_step=2",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         "callbacks=quiet",
         "evaluate.train=0",
         "optim=step",
         "trainer=cpu",
         "trainer.max_epochs=4",
     ]
-    run(["train.py"], *common, "callbacks.snapshots.every_n_epochs=1", f"paths.output={tmp_path / 'whole'}")
+    snapshots = ["callbacks.snapshots.every_n_epochs=1", f"paths.output={tmp_path / 'whole'}"]
+    assert run_command(monkeypatch, *common, *snapshots) == 0
     whole = only_run(tmp_path / "whole") / "checkpoints"
     half = whole / "step_0000008.ckpt"
     run(
@@ -267,8 +270,9 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path):
     for name, value in states[0]["state_dict"].items():
         assert torch.equal(value, states[1]["state_dict"][name]), name
     others = ["decoder.dropout=0.2", "seed=1", "trainer.gradient_clip_val=1.0"]
-    done = run(["train.py"], *common, f"ckpt_path={half}", *others, expect=2)
-    assert "decoder.dropout=0.1 (now 0.2), seed=0 (now 1), trainer.gradient_clip_val=None" in done.stderr
+    assert run_command(monkeypatch, *common, f"ckpt_path={half}", *others) == 2
+    differing = "decoder.dropout=0.1 (now 0.2), seed=0 (now 1), trainer.gradient_clip_val=None"
+    assert differing in capsys.readouterr().err
 
 
 def curve(folder: Path, tag: str) -> list[float]:
@@ -277,7 +281,7 @@ def curve(folder: Path, tag: str) -> list[float]:
     return [event.value for event in events.Scalars(tag)]
 
 
-def test_two_processes_train_like_one_with_the_same_batch(tmp_path):
+def test_two_processes_train_like_one_with_the_same_batch(tmp_path, monkeypatch):
     """Gloo on the CPU; each process reads half of a batch's shapes, and codes are longer than max_norm."""
     common = [
         *TINY,
@@ -285,13 +289,13 @@ def test_two_processes_train_like_one_with_the_same_batch(tmp_path):
         "data.held_out=0",
         "data.loader.passes_per_epoch=10",
         "codes.max_norm=0.9",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         "callbacks=none",
         "evaluate.train=0",
         "trainer.max_epochs=1",
         "trainer.log_every_n_steps=1",
     ]
-    run(["train.py"], *common, "trainer=cpu", f"paths.output={tmp_path / 'one'}")
+    assert run_command(monkeypatch, *common, "trainer=cpu", f"paths.output={tmp_path / 'one'}") == 0
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     run(["train.py"], *common, *two, f"paths.output={tmp_path / 'two'}")
     folders = [only_run(tmp_path / name) for name in ("one", "two")]
@@ -372,31 +376,31 @@ def test_a_full_memory_of_the_gpu_is_one_line(tmp_path, monkeypatch):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
 
     monkeypatch.setattr(L.pytorch.Trainer, "fit", full)
-    shapes = ["data.shapes=1", "data.held_out=0", f"data.store={tmp_path / 'store'}", "callbacks=none"]
+    shapes = ["data.shapes=1", "data.held_out=0", f"data.store={STORE}", "callbacks=none"]
     with pytest.raises(SdfhubError, match=r"lower computing\.points_at_once"):
         task.train_into(composed(*TINY, *shapes), tmp_path / "run")
 
 
-def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path):
-    done = run(
-        ["train.py"],
+def test_a_diverging_run_stops_with_its_step_and_a_hint(tmp_path, monkeypatch, capsys):
+    status = run_command(
+        monkeypatch,
         *TINY,
         "data.shapes=2",
         "data.held_out=0",
         "optim.lr_decoder=1e30",
         "activation=relu",
         "callbacks=none",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
-        expect=2,
     )
-    assert "Traceback" not in done.stderr
-    message = done.stderr.strip().splitlines()[-1]
+    printed = capsys.readouterr().err
+    assert status == 2 and "Traceback" not in printed
+    message = printed.strip().splitlines()[-1]
     assert "not finite at step" in message
     assert "lower optim.lr_decoder" in message
 
 
-def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_path):
+def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_path, monkeypatch, capsys):
     import trimesh
 
     meshes = tmp_path / "meshes"
@@ -405,20 +409,21 @@ def test_one_bad_mesh_among_many_is_rejected_by_name_and_the_rest_goes_on(tmp_pa
         vertices, faces = generate("chairs", index)
         trimesh.Trimesh(vertices, faces).export(meshes / f"chair_{index}.obj")
     (meshes / "broken.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    done = run(
-        ["-m", "sdfhub", "prepare"],
+    status = run_command(
+        monkeypatch,
         "data=folder",
         f"data.source.root={meshes}",
         "data.shapes=4",
         "data.held_out=0",
         "data.preparation.samples=2000",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
+        task="prepare",
     )
-    assert "3 shapes kept, 1 rejected" in done.stdout
-    assert "broken" in done.stdout
+    printed = capsys.readouterr().out
+    assert status == 0 and "3 shapes kept, 1 rejected" in printed and "broken" in printed
 
 
-def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tmp_path):
+def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tmp_path, monkeypatch, capsys):
     rng = np.random.default_rng(0)
     for index in range(3):
         points = rng.uniform(-1, 1, (6000, 3))
@@ -436,22 +441,25 @@ def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tm
         f"data.source.root={tmp_path / 'SdfSamples'}",
         "data.shapes=2",
         "data.held_out=1",
-        f"data.store={tmp_path / 'store'}",
+        "trainer.check_val_every_n_epoch=5",
+        "callbacks.mesh.resolution=24",
+        "callbacks.slices.times=1",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
     ]
-    refused = run(["train.py"], *common, expect=2)
-    assert "train with normals=off" in refused.stderr.strip().splitlines()[-1]
-    done = run(["train.py"], *common, "normals=off", "trainer.max_epochs=5")
-    assert "judged by signed distances" in done.stdout
+    assert run_command(monkeypatch, *common) == 2
+    assert "train with normals=off" in capsys.readouterr().err.strip().splitlines()[-1]
+    assert run_command(monkeypatch, *common, "normals=off", "trainer.max_epochs=5") == 0
+    assert "judged by signed distances" in capsys.readouterr().out
     metrics = json.loads((only_run(tmp_path / "outputs") / "metrics.json").read_text())
     assert metrics["train"]["summary"]["sign_accuracy"]["mean"] > 0.95
     assert len(metrics["held_out"]["shapes"]) == 1
 
 
 @pytest.mark.skipif(not OPEN.is_dir(), reason="data/open is not there; `make data` fetches it")
-def test_real_furniture_trains_to_a_table(tmp_path):
-    run(
-        ["train.py"],
+def test_real_furniture_trains_to_a_table(tmp_path, monkeypatch):
+    status = run_command(
+        monkeypatch,
         *TINY,
         "data=open",
         "category=chairs",
@@ -459,9 +467,10 @@ def test_real_furniture_trains_to_a_table(tmp_path):
         "data.held_out=1",
         "trainer.max_epochs=6",
         "callbacks=none",
-        f"data.store={tmp_path / 'store'}",
+        f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",
     )
+    assert status == 0
     folder = only_run(tmp_path / "outputs")
     metrics = json.loads((folder / "metrics.json").read_text())
     assert len(metrics["train"]["shapes"]) >= 2

@@ -33,19 +33,24 @@ TINY = [
     "decoder.code_size=8",
     "evaluate.resolution=24",
     "evaluate.points=500",
-    "evaluate.pictures=1",
+    "evaluate.pictures=0",
     "fit.samples=500",
-    "trainer.max_epochs=3",
-    "trainer.check_val_every_n_epoch=1",
+    "fit.steps=5",
+    "trainer.max_epochs=2",
+    "trainer.check_val_every_n_epoch=2",
     "trainer.log_every_n_steps=2",
     "callbacks.mesh.resolution=24",
     "callbacks.mesh.points=500",
     "validation.resolution=24",
     "validation.points=500",
+    "validation.fit.steps=3",
 ]
 
 UNUSED = tempfile.TemporaryDirectory(prefix="sdfhub-")
 """Where a composed config that is not run as a task says that it writes."""
+
+STORE = Path(UNUSED.name) / "store"
+"""Prepared shapes that the trainings of a process share: to prepare them is most of a tiny training."""
 
 
 def run_command(monkeypatch, *words: str, task: str = "train") -> int:
@@ -61,7 +66,7 @@ def run_command(monkeypatch, *words: str, task: str = "train") -> int:
 
 def train_tiny(monkeypatch, folder: Path, *words: str) -> Path:
     """The run's folder of a training that ended well."""
-    places = [f"hydra.run.dir={folder}", f"data.store={folder.parent / 'store'}"]
+    places = [f"hydra.run.dir={folder}", f"data.store={STORE}"]
     bare = any(word.startswith(("callbacks=", "debug=")) for word in words)
     tiny = [word for word in TINY if not (bare and word.startswith("callbacks."))]
     assert run_command(monkeypatch, *tiny, *places, *words) == 0
