@@ -6,8 +6,7 @@ import trimesh
 
 from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.errors import SdfhubError
-from sdfhub.scans.cloud import free_space, is_outside, noise_of, winding
-from sdfhub.scans.evidence import Evidence
+from sdfhub.scans.evidence import Evidence, free_space, is_outside, noise_of, winding
 from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import Scan, read_scan
 from sdfhub.scans.simulated import surface_scan, view_scan

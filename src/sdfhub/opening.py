@@ -41,9 +41,6 @@ if TYPE_CHECKING:
 FORMAT = "sdfhub space 2"
 """What an exported file says it is; another number where its content means something else."""
 
-About = dict[str, Any]
-"""Plain data of a space: description of its model, config, ids, frames, up, metrics."""
-
 
 def load(
     path: str | Path, device: str | torch.device | None = None, trust: str | Sequence[str] = ()
@@ -83,7 +80,7 @@ def load(
 
 def write_space(space: Space, path: Path) -> None:
     """Writes a space as one file, whole or not at all."""
-    about: About = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
+    about: dict[str, Any] = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
     about |= {"frames": _plain_frames(space.frames), "metrics": space.metrics}
     tensors = {f"decoder.{name}": tensor for name, tensor in space.decoder.state_dict().items()}
     tensors = {name: tensor.cpu().contiguous() for name, tensor in (tensors | {"codes": space.codes}).items()}
@@ -148,7 +145,7 @@ def beside(run: str, out: str | None, name: str) -> Path:
     return Path(out) if out else (Path(run) if Path(run).is_dir() else Path(run).parent) / name
 
 
-def _of_run(run: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+def _of_run(run: Path) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
     config, split = read_run(run)
     checkpoint, frames, metrics = run / "checkpoints" / LAST, run / "frames.json", run / "metrics.json"
     content = read_checkpoint(checkpoint)
@@ -157,13 +154,13 @@ def _of_run(run: Path) -> tuple[About, dict[str, Tensor], Tensor]:
         raise SdfhubError(f"{checkpoint}: not a checkpoint of an auto-decoder")
     codes = weights.pop("codes.table")
     weights = {name.removeprefix("decoder."): weight for name, weight in weights.items()}
-    about: About = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
+    about: dict[str, Any] = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
+    about["metrics"] = json.loads(metrics.read_bytes()) if metrics.exists() else None
     known = json.loads(frames.read_bytes()) if frames.exists() else {"up": "z", "shapes": {}}
-    about |= {"metrics": json.loads(metrics.read_bytes()) if metrics.exists() else None}
     return about | {"up": known["up"], "frames": known["shapes"]}, weights, codes
 
 
-def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+def _of_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

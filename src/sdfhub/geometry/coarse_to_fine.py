@@ -57,8 +57,7 @@ def sample_blocks(grid: Grid) -> SampledCells:
     if grid.n <= _SMALL:
         return SampledCells(cells, values, np.full(len(cells), np.inf))
     fields = values.reshape(-1, m, m, m)
-    bounds = [_slope_bounds(*pair) for pair in zip(np.abs(fields), _slope(fields, stride), strict=True)]
-    sampled = SampledCells(cells, values, SAFETY * np.stack(bounds).reshape(-1))
+    sampled = SampledCells(cells, values, SAFETY * _slope_bounds(fields, stride).reshape(-1))
     while stride > 2:
         sampled = _refine(grid, sampled.candidates(stride), stride // 2)
         stride //= 2
@@ -127,10 +126,12 @@ def _centre_keys(cells: np.ndarray, stride: int, n: int) -> np.ndarray:
     return _node_keys(cells, stride, [stride // 2], n).reshape(-1)
 
 
-def _slope_bounds(size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """[m, m, m] the steepest slope around a cell, and no less than near the surface."""
-    near = slope[size <= np.quantile(size, _NEAR)]
-    return np.maximum(maximum_filter(slope, 3), np.quantile(near, 0.9))
+def _slope_bounds(fields: np.ndarray, stride: int) -> np.ndarray:
+    """[S, m, m, m] the steepest slope around a cell, and no less than near the shape's surface."""
+    slopes = _slope(fields, stride)
+    near = [slope[abs(f) <= np.quantile(abs(f), _NEAR)] for f, slope in zip(fields, slopes, strict=True)]
+    least = np.array([np.quantile(slope, 0.9) for slope in near])[:, None, None, None]
+    return np.maximum(maximum_filter(slopes, (1, 3, 3, 3)), least)
 
 
 def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
