@@ -18,8 +18,7 @@ from tqdm import tqdm
 from sdfhub.checkpoint_file import LAST
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
-from sdfhub.reconstruction.reconstructor import Reconstructor
-from sdfhub.reconstruction.result import Limits
+from sdfhub.reconstruction.reconstructor import Limits, Reconstructor
 from sdfhub.scans.evidence import BOUNDS
 from sdfhub.scans.simulated import VIEWS, ScanKind
 from sdfhub.whole_file import file_sha256, write_whole
