@@ -26,7 +26,6 @@ def made_with(trainer: Trainer) -> dict[str, str]:
 
 
 def _processor() -> str:
-    """The processor's name; Python itself knows it on few systems."""
     cpuinfo = Path("/proc/cpuinfo")
     name = re.search(r"model name\s*: (.*)", cpuinfo.read_text("utf-8")) if cpuinfo.exists() else None
     return name[1] if name else platform.processor() or "unknown"

@@ -82,22 +82,14 @@ def judge(
     cd = float(np.mean(there**2) + np.mean(back**2))
     values |= {"cd": cd, "excess": cd - values["floor"], "cd_source": cd / float(truth.scale) ** 2}
     values |= {"normal_consistency": float(np.mean(cosines)), "iou": volumetric_iou(mesh, true_mesh, seed)}
-    values |= _surface_metrics(point_to_surface(samples, *true_mesh), point_to_surface(expected, *mesh), tau)
-    return ShapeMetrics(**values)
-
-
-def _surface_metrics(to_truth: np.ndarray, to_mesh: np.ndarray, tau: float) -> dict[str, float]:
-    """Metrics from exact distances [N] of samples to the other surface: they have no noise floor."""
+    # exact distances of samples to the other surface have no noise floor
+    to_truth, to_mesh = point_to_surface(samples, *true_mesh), point_to_surface(expected, *mesh)
+    for name, distances in (("accuracy", to_truth), ("completeness", to_mesh)):
+        values |= {name: float(distances.mean()), f"{name}_p95": float(np.percentile(distances, 95))}
     precision, recall = float(np.mean(to_truth < tau)), float(np.mean(to_mesh < tau))
-    values = {
-        "point_to_surface": (to_truth.mean() + to_mesh.mean()) / 2,
-        "accuracy": to_truth.mean(),
-        "accuracy_p95": np.percentile(to_truth, 95),
-        "completeness": to_mesh.mean(),
-        "completeness_p95": np.percentile(to_mesh, 95),
-        "f_score": 2 * precision * recall / max(precision + recall, 1e-12),
-    }
-    return {name: float(value) for name, value in values.items()}
+    values["point_to_surface"] = (values["accuracy"] + values["completeness"]) / 2
+    values["f_score"] = 2 * precision * recall / max(precision + recall, 1e-12)
+    return ShapeMetrics(**values)
 
 
 def judge_pair(pair: tuple[Mesh, NormalizedMesh], points: int, seed: int) -> ShapeMetrics:

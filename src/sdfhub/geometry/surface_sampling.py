@@ -32,10 +32,8 @@ def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Genera
     root = np.sqrt(rng.random(len(face), corners.dtype))
     third = root * rng.random(len(face), corners.dtype)
     corner = corners[face]
-    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
-    points += third[:, None] * (corner[:, 2] - corner[:, 0])
-    points += corner[:, 0]
-    return points
+    edges = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return (root - third)[:, None] * edges[0] + third[:, None] * edges[1] + corner[:, 0]
 
 
 def sphere_directions(count: int) -> np.ndarray:
