@@ -28,7 +28,7 @@ demo: install ## train HOSC + Fourier + normals on procedural chairs and print t
 	$(BIN)/python train.py experiment=fft_hosc scale=demo
 
 test: $(DEV_STAMP) ## run the tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(DEV_STAMP) ## check style and types
 	$(BIN)/ruff check .

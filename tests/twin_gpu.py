@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable
+from functools import cache
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from tests.tiny import build_autodecoder, composed
 
 torch.utils.rename_privateuse1_backend("twin")
 GPU = torch.device("twin", 0)
+config_of = cache(composed)
 EXPERIMENTS = (
     *("deepsdf", "siren", "fft_siren", "fft_hosc", "hash_siren", "hash_hosc"),
     *("fft_finer", "fft_gauss", "fft_wire"),
@@ -53,7 +55,7 @@ class Stored:
 def model_of(experiment: str, *overrides: str) -> AutoDecoder:
     """A model for six shapes whose parameters and buffers are fakes on the device."""
     with torch._subclasses.fake_tensor.unset_fake_temporarily():
-        model = build_autodecoder(composed(f"experiment={experiment}", *overrides), rows=6)
+        model = build_autodecoder(config_of(f"experiment={experiment}", *overrides), rows=6)
     for module in model.modules():
         for name, parameter in module._parameters.items():
             if parameter is not None:
