@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
     else:
         import trimesh  # here: slow to import, and every training would wait for it before its first step
 
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
         write_whole(path, mesh.export(file_type=path.suffix[1:]))
 
 

@@ -41,7 +41,7 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
     known frame is given. A view shows no whole bounding box, so that its frame must be known or unknown.
     """
     if scan.faces is not None:
-        return _observe_mesh(scan, evidence, frame, rng)
+        return _observe_mesh(scan, scan.faces, evidence, frame, rng)
     if scan.kind == "view" and frame == "shape":
         raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
     if isinstance(frame, Frame):
@@ -68,11 +68,13 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
     return ObservedScan(scan.kind, len(points), observation, lies)
 
 
-def _observe_mesh(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
+def _observe_mesh(
+    scan: Scan, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
+) -> ObservedScan:
     if isinstance(frame, Frame):
         _refuse_misplaced(frame.to_normalized(scan.points), LARGEST)
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
-    prepared = prepare_mesh((scan.points, scan.faces), preparation)
+    prepared = prepare_mesh((scan.points, faces), preparation)
     points, sdf, own = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64), prepared.frame
     if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
         samples = Scan(own.to_source(points), sdf=sdf / own.scale)

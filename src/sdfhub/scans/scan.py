@@ -3,6 +3,7 @@
 import io
 import re
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,11 +74,13 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: no such file")
     if path.stat().st_size > MAX_BYTES:
         raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
+    readers: dict[str, Callable[[Path], np.ndarray]]
+    readers = {".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}
     try:
         if suffix == ".npz":
             return _archive(path)
-        if suffix in (".xyz", ".npy") or (suffix == ".ply" and not _has_faces(path)):
-            return _cloud({".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}[suffix](path))
+        if suffix in readers and not (suffix == ".ply" and _has_faces(path)):
+            return _cloud(readers[suffix](path))
         vertices, faces = read_mesh(path)
         return Scan(vertices, faces=faces)
     except RejectedMesh as rejection:
