@@ -143,7 +143,7 @@ def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch,
 
 
 MISTAKES = [
-    ("interpolate", ["a=balls/smal", "b=0"], "did you mean 'balls/small'"),
+    ("interpolate", ["a=balls/smal", "b=0"], "it has balls/small"),
     ("interpolate", ["a=0"], "Missing mandatory value: b"),
     ("interpolate", ["a=0", "b=1", "steps=1"], "steps=1: must be a whole number, at least 2"),
     ("interpolate", ["a=0", "b=1", "resolution=fine"], "resolution='fine'"),
