@@ -25,7 +25,7 @@ import numpy as np
 import trimesh
 from runs import ROOT, head, row
 
-from sdfhub.data.preparation.normalize import normalize_mesh
+from sdfhub.data.preparation.sampling import normalize_mesh
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.metrics import chamfer, judge_pair
 from sdfhub.geometry.surface_sampling import sample_surface

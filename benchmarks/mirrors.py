@@ -18,8 +18,7 @@ from scipy.stats import spearmanr
 
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.report.pictures import reconstruction
-from sdfhub.report.plan import PlannedCell
-from sdfhub.report.results import Cell, ShapeScore, read_scores
+from sdfhub.report.results import Cell, PlannedCell, ShapeScore, read_scores
 from sdfhub.tasks.report import truth_finder
 
 POINTS, FAR = 10_000, 0.05

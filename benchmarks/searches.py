@@ -27,8 +27,7 @@ from runs import head, row
 
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.search import objective
-from sdfhub.report.plan import read_plan
-from sdfhub.report.results import Scores, read_scores, read_sweep
+from sdfhub.report.results import Scores, read_plan, read_scores, read_sweep
 from sdfhub.settings import flat
 from sdfhub.whole_file import write_whole
 
@@ -71,8 +70,9 @@ def read_search(folder: Path) -> list[Trial]:
     fixed = {key for command in read_plan(folder).commands for key in KEYS.findall(command)}
     searched = [key for key in everywhere if key not in fixed]
     found = [
-        Trial("", judged(cell.folder, cell.scores), {key: shown(cell.plan.settings[key]) for key in searched})
+        Trial("", scores, {key: shown(cell.plan.settings[key]) for key in searched})
         for cell in cells
+        for scores in [judged(cell.folder, cell.scores if cell.state == "done" else None)]
     ]
     found.sort(key=lambda trial: trial.scores["objective"] or float("inf"))
     ranked = [trial._replace(name=str(rank)) for rank, trial in enumerate(found, 1)]

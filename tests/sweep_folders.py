@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 import yaml
 
-from sdfhub.report.plan import PlannedCell, enter_cells
+from sdfhub.report.results import PlannedCell, enter_cells
 
 CHOICES = {
     "DeepSDF": {"experiment": "deepsdf", "activation": "relu", "encoding": "none", "decoder": "deepsdf"},

@@ -145,7 +145,7 @@ def test_the_run_carries_the_experiments_settings(config, tmp_path):
     config, split = read_run(tmp_path / "run")
     assert split == {"train": IDS, "held_out": []} and space.up == "y"
     assert config["codes"]["max_norm"] == 1.0 and config["loss"]["delta"] == 0.2
-    assert config["decoder"]["dropout"] == 0.2 and config["decoder"]["weight_norm"]
+    assert config["decoder"]["dropout"] == 0.2
     assert not set(OWN_KEYS) & set(config)
     assert json.loads((tmp_path / "run" / "specs.json").read_text())["Description"] == "balls"
 
@@ -172,8 +172,8 @@ def test_without_its_split_shapes_are_numbered_and_another_split_can_be_given(co
 
 
 REFUSED = {
-    "LayerNorm": {"weight_norm": False},
-    "a tanh before": {"use_tanh": True},
+    "norm_layers": {"weight_norm": False},
+    "use_tanh": {"use_tanh": True},
     "different widths": {"dims": [W, W, W, W, W + 1]},
     "geom_dimension": {"geom_dimension": 2},
     "latent_in": {"latent_in": [0]},

@@ -12,7 +12,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.made_with import made_with
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import begin_run
-from sdfhub.tasks.resuming import refuse_other_shapes
+from sdfhub.tasks.train import refuse_other_shapes
 from sdfhub.whole_file import refuse_unwritable
 from tests.tiny import composed
 

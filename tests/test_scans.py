@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sdfhub.data.preparation.normalize import normalize_mesh
+from sdfhub.data.preparation.sampling import normalize_mesh
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import Evidence, free_space, is_outside, noise_of, winding
 from sdfhub.scans.observed_scan import observe

@@ -10,8 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch._dynamo.backends.common import aot_autograd
 
-from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading, ResidentBatches, StepBatches
 from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Hosc, Relu, Siren
 from sdfhub.model.decoder import activated

@@ -10,8 +10,7 @@ from hydra.types import RunMode
 
 from sdfhub.multirun.cells import finished
 from sdfhub.multirun.sweep import planned_cells
-from sdfhub.report.plan import PlannedCell
-from sdfhub.report.results import Cell, read_sweep
+from sdfhub.report.results import Cell, PlannedCell, read_sweep
 from sdfhub.report.rows import group_cells
 from tests.stand_in_training import CONF, of_multirun, stand_in
 
@@ -36,7 +35,7 @@ def test_two_cells_of_a_sweep_never_share_a_folder(sweep):
 
 def test_the_tables_have_the_papers_rows_and_their_rivals():
     def labels(sweep: str) -> list[str]:
-        missing = [Cell(cell, Path(cell.folder), "missing", "", None) for cell in cells(f"sweeps={sweep}")]
+        missing = [Cell(cell, Path(cell.folder), "missing") for cell in cells(f"sweeps={sweep}")]
         return [row.label for group in group_cells(missing) for row in group.rows]
 
     methods = ("SIREN", "FFT/SIREN", "FFT/HOSC", "HASH/SIREN", "HASH/HOSC")

@@ -16,8 +16,7 @@ from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from sdfhub.data.loading.batches import Augmentation, Loading
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading, ResidentBatches
 from sdfhub.geometry.grid import Grid
 from sdfhub.latent.gaussian import Gaussian
 from sdfhub.latent.problem import Prior, Problem, Rows

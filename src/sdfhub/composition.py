@@ -33,16 +33,7 @@ def one_line(error: BaseException) -> str:
 
 
 def instantiate(config: Any, key: str, **given: Any) -> Any:
-    """The object that a node of the user's own config describes: `hydra.utils.instantiate`, checked before.
-
-    Args:
-        config: a node with `_target_`, or a mapping or list of such; None stays None.
-        key: where it stands in the config, for messages.
-        given: arguments that come from code.
-
-    Raises:
-        SdfhubError: no such class or argument, a value of the wrong type, or what the class says of it.
-    """
+    """The object that a node at `key` of the user's own config describes, checked before it is made."""
     node = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     _check(node, key, given)
     try:
@@ -68,10 +59,7 @@ def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A config as plain data with its interpolations resolved, but `${oc.env:NAME}` as it is written.
-
-    The environment holds keys and passwords; a run's config is written down and passed on.
-    """
+    """A config as plain data, interpolations resolved but `${oc.env:NAME}`, which may be a password."""
     written = lambda *words: "${oc.env:" + ",".join(map(str, words)) + "}"  # noqa: E731
     OmegaConf.register_new_resolver("oc.env", written, replace=True)
     try:

@@ -17,10 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class WholeFileIO(TorchCheckpointIO):
-    """Writes a checkpoint whole or not at all; reads none that is damaged.
-
-    Lightning's own writer copies across file systems: a kill leaves half a file where the last good one was.
-    """
+    """Writes a checkpoint whole or not at all, also across file systems; reads none that is damaged."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         write_checkpoint(checkpoint, Path(path))
@@ -34,10 +31,7 @@ class StopOnSignal(L.Callback):
 
     SIGTERM, SIGINT and SIGHUP end the process with status 143, 130 and 129, as the shell counts them; a
     second signal ends it at once. SIGUSR1 under SLURM (`sbatch --signal=USR1@120`) also has the job put back
-    into the queue. With `accumulate_grad_batches` a step has several batches.
-
-    Args:
-        dirpath: folder of the checkpoints.
+    into the queue. With `accumulate_grad_batches` a step has several batches. `dirpath` has the checkpoints.
     """
 
     def __init__(self, dirpath: str | Path):
@@ -49,10 +43,8 @@ class StopOnSignal(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._signal, self._step = None, trainer.global_step
         numbers = [signal.SIGTERM, signal.SIGINT]
-        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup
-            numbers.append(signal.SIGHUP)
-        if "SLURM_JOB_ID" in os.environ:
-            numbers.append(signal.SIGUSR1)
+        numbers += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []  # nohup
+        numbers += [signal.SIGUSR1] if "SLURM_JOB_ID" in os.environ else []
         if threading.current_thread() is threading.main_thread():  # else a notebook's or launcher's business
             self._handlers = {number: signal.signal(number, self._receive) for number in numbers}
 
@@ -65,9 +57,8 @@ class StopOnSignal(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
         before, self._step = self._step, trainer.global_step
-        if self._step == before:
-            return  # the gradient is still accumulated
-        if not trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
+        is_whole = self._step != before  # else the gradient is still accumulated
+        if not (is_whole and trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False)):
             return
         self._save(trainer)
         log.warning("stopped after step %d: %s", trainer.global_step, self.path)

@@ -67,7 +67,6 @@ class MeshShapes(ShapesShown):
     Shapes without a true mesh are skipped. A field without a surface counts in `mesh/failed`.
 
     Args:
-        times, shapes: as for `ShapesShown`.
         resolution, points: along an axis of the marching-cubes grid; a side of the Chamfer distance.
     """
 
@@ -79,8 +78,8 @@ class MeshShapes(ShapesShown):
         self._truth_pictures: dict[str, np.ndarray] = {}  # of the shapes whose true mesh was shown
 
     def show(self, trainer: L.Trainer, module: AutoDecoder, shapes: list[StoredShape]) -> None:
-        pairs = [(row, shape, shape.mesh) for row, shape in enumerate(shapes)]
-        metrics = [self._show_shape(trainer, module, row, shape, mesh) for row, shape, mesh in pairs if mesh]
+        pairs = zip(shapes, module.codes.table, strict=False)
+        metrics = [self._show_shape(trainer, module, *pair, mesh) for pair in pairs if (mesh := pair[0].mesh)]
         judged = [scores for scores in metrics if not scores.failed]
         values = {"mesh/failed": float(len(metrics) - len(judged))} if metrics else {}
         for name, factor in METRICS.items() if judged else ():
@@ -89,10 +88,10 @@ class MeshShapes(ShapesShown):
             logger.log_metrics(values, trainer.global_step)
 
     def _show_shape(
-        self, trainer: L.Trainer, module: AutoDecoder, row: int, shape: StoredShape, truth: NormalizedMesh
+        self, trainer: L.Trainer, module: AutoDecoder, shape: StoredShape, code: Tensor, truth: NormalizedMesh
     ) -> ShapeMetrics:
         try:
-            mesh = next(reconstruct(module.decoder, module.codes.table[row][None], self.resolution))
+            mesh = next(reconstruct(module.decoder, code[None], self.resolution))
         except SdfhubError:  # the field is not finite: the loss will say so, with a hint
             mesh = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
         if shape.id not in self._truth_pictures:
@@ -112,10 +111,7 @@ class Slices(ShapesShown):
 
     def show(self, trainer: L.Trainer, module: AutoDecoder, shapes: list[StoredShape]) -> None:
         for shape, code in zip(shapes, module.codes.table, strict=False):
-
-            def field(points: Tensor, code: Tensor = code) -> Tensor:
-                return distances(module.decoder, points[None], code[None])[0]
-
+            field = lambda points, code=code: distances(module.decoder, points[None], code[None])[0]  # noqa: E731
             try:
                 grid = sdf_slice(field, axis=0, device=code.device)
             except SdfhubError:  # as for `MeshShapes`

@@ -16,9 +16,7 @@ class ProgressLines(ProgressBar):
     def disable(self) -> None:
         """Has no effect: lines are logged by the first process alone."""
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, *_: Any
-    ) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: Any, outputs: Any, *_: Any) -> None:
         step, steps = trainer.global_step, trainer.estimated_stepping_batches  # inf where no end is set
         if trainer.is_global_zero and step * 10 // steps > (step - 1) * 10 // steps:
             epoch, loss = trainer.current_epoch + 1, float(outputs["loss"])
@@ -33,9 +31,6 @@ def progress(bar: Literal["tqdm", "rich"] = "tqdm") -> ProgressBar:
 
 
 def fitting_callbacks(callbacks: list[L.Callback], loggers: bool, progress_bar: bool) -> list[L.Callback]:
-    """The callbacks that a trainer takes: Lightning refuses some where it has nothing for them to do.
-
-    A `LearningRateMonitor` needs a logger, a bar the trainer's `enable_progress_bar`.
-    """
+    """Without the callbacks that Lightning refuses: it has no logger for them, or no progress bar."""
     dropped = (*([] if loggers else [LearningRateMonitor]), *([] if progress_bar else [ProgressBar]))
     return [callback for callback in callbacks if not isinstance(callback, dropped)]

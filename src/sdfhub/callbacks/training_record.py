@@ -16,11 +16,10 @@ LAST = 20  # steps whose losses are averaged
 
 
 class TrainingRecord(L.Callback):
-    """Seconds, steps and the last losses of a training.
+    """Seconds, steps and the last losses of a training, also of the processes that it was continued from.
 
     The clock starts after the first step of a process, in which loops are compiled. It stands still during
-    validation and in `clock_stopped`. What an interrupted training had gathered by its last checkpoint counts
-    when the training is continued.
+    validation and in `clock_stopped`.
     """
 
     def __init__(self) -> None:
@@ -34,20 +33,16 @@ class TrainingRecord(L.Callback):
             self.stepped, self._started = True, time.perf_counter()
         self._losses.append(outputs["loss"])
 
-    def stop_clock(self) -> bool:
-        """Counts no seconds from now on; returns whether it did before."""
-        was_running = self._started is not None
+    def stop_clock(self, *_: Any) -> None:
+        """Counts no seconds from now on."""
         self._seconds, self._started = self._so_far(), None
-        return was_running
 
-    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
-        self.stop_clock()
-
-    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
+    def start_clock(self, *_: Any) -> None:
+        """Counts seconds again, if the first step has been."""
         self._started = time.perf_counter() if self.stepped else None
 
-    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
-        self.stop_clock()
+    on_validation_start = on_train_end = stop_clock  # type: ignore[assignment]
+    on_validation_end = start_clock  # type: ignore[assignment]
 
     def _so_far(self) -> float:
         return self._seconds + (time.perf_counter() - self._started if self._started else 0.0)
@@ -73,8 +68,9 @@ class TrainingRecord(L.Callback):
 def clock_stopped(trainer: L.Trainer) -> Iterator[None]:
     """The trainer's `TrainingRecord`, if it has one, counts no seconds within; for callbacks that draw."""
     callbacks: list[L.Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    records = [callback for callback in callbacks if isinstance(callback, TrainingRecord)]
-    was_running = [record for record in records if record.stop_clock()]
+    running = [record for record in callbacks if isinstance(record, TrainingRecord) and record._started]
+    for record in running:
+        record.stop_clock()
     yield
-    for record in was_running:
-        record._started = time.perf_counter()
+    for record in running:
+        record.start_clock()

@@ -15,9 +15,8 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from tqdm import tqdm
 
-from sdfhub.data.loading.batches import draw_rows
 from sdfhub.data.store.store import shape_seed
-from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape, draw_rows
 from sdfhub.data.workers import stream_in_processes
 from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, write_scores
 from sdfhub.geometry.mesh_file import write_mesh

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveI
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from sdfhub.data.loading.batches import signed_samples
+from sdfhub.data.store.stored_shape import signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer
 from sdfhub.geometry.surface_sampling import sample_surface

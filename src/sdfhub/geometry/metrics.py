@@ -80,7 +80,7 @@ def judge(
     pairs = (normals, true_normals[partner]), (true_normals, normals[origin])
     cosines = [np.abs(np.einsum("ij,ij->i", *pair)).mean() for pair in pairs]
     cd = float(np.mean(there**2) + np.mean(back**2))
-    values |= {"cd": cd, "excess": cd - values["floor"], "cd_source": cd / float(truth.scale) ** 2}
+    values |= {"cd": cd, "excess": cd - values["floor"], "cd_source": cd / float(truth.frame.scale) ** 2}
     values |= {"normal_consistency": float(np.mean(cosines)), "iou": volumetric_iou(mesh, true_mesh, seed)}
     # exact distances of samples to the other surface have no noise floor
     to_truth, to_mesh = point_to_surface(samples, *true_mesh), point_to_surface(expected, *mesh)

@@ -5,7 +5,7 @@ import logging
 import os
 import traceback
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from sdfhub.composition import plain
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import choices_of
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells
-from sdfhub.report.results import read_scores
+from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_scores
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
@@ -24,26 +23,21 @@ Train = Callable[[DictConfig, Path], dict[str, Any]]
 """Trains what a composed config describes into a folder; returns what `metrics.json` holds."""
 
 WATCHING_GROUPS = ("callbacks", "logger", "debug", "paths", "extras")
-UNNAMED_GROUPS = ("conditioning", "decoder", "loss", "optim")
-"""Groups that no name of a row tells: on the command line they count as settings."""
+UNNAMED = {"conditioning", "decoder", "loss", "optim"}  # groups that name no row: they count as settings
 
 log = logging.getLogger(__name__)
 
 
 def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, Any]:
-    """Trains a cell of a multirun unless it is finished or another process trains it.
+    """Trains a cell of a multirun unless it is finished; returns what `metrics.json` holds.
 
     A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher.
-
-    Returns:
-        What `metrics.json` holds; empty for a cell that failed or that another process trains.
     """
     folder = Path(hydra.runtime.output_dir)
     # ddp processes that SLURM or torchrun started train a cell together: the first holds the lock for all
     follows = any(os.environ.get(rank, "0") != "0" for rank in ("SLURM_PROCID", "RANK"))
     try:
-        # a report holds the lock for a moment, a training for hours
-        with nullcontext() if follows else FileLock(folder / ".lock", timeout=1):
+        with nullcontext() if follows else FileLock(folder / ".lock", timeout=0):
             enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
             return go_on(train, config, folder)
     except Timeout:
@@ -71,12 +65,11 @@ def go_on(train: Train, config: DictConfig, folder: Path) -> dict[str, Any]:
 
 def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
     """The metrics of a run that was trained and judged under these settings; None where it was not."""
-    try:
+    with suppress(OSError, SdfhubError):
         trained = read_scores(folder).config  # raises where a report could not read the scores
-        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    except (OSError, SdfhubError):
-        return None
-    return metrics if settings_digest(trained) == settings_digest(config) else None
+        if settings_digest(trained) == settings_digest(config):
+            return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return None
 
 
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
@@ -84,12 +77,7 @@ def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedC
     choices = choices_of(config, hydra)
     words: Any = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} as written
     pairs = [word.lstrip("+~").partition("=") for word in words]
-    named = {group for group in choices if group not in UNNAMED_GROUPS}
-    return PlannedCell(
-        folder=folder,
-        choices={group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS},
-        settings={
-            k: v for k, _, v in pairs if k not in named and not k.startswith(("seed", *WHERE_NOT_WHAT))
-        },
-        seed=config.seed,
-    )
+    other = ("seed", *WHERE_NOT_WHAT)
+    settings = {k: v for k, _, v in pairs if not k.startswith(other) and k not in choices.keys() - UNNAMED}
+    choices = {group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS}
+    return PlannedCell(folder=folder, choices=choices, settings=settings, seed=config.seed)

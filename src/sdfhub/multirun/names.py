@@ -3,6 +3,8 @@
 import os
 import re
 import uuid
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +32,11 @@ def eighth(count: object) -> int:
     return max(1, count // 8) if isinstance(count, int) else 1
 
 
-def run_name(*, _root_: DictConfig) -> str:
+def run_name(*, _root_: DictConfig, groups: Sequence[str] = NAMED_GROUPS) -> str:
     """Folder name of a run from the choices that tell it from others: `procedural_chairs_hosc_...`."""
-    return _joined(_root_, NAMED_GROUPS)
+    choices = choices_of(_root_, _root_.hydra)
+    words = [("normals-" if g == "normals" else "") + choices[g] for g in groups if g in choices]
+    return "_".join(re.sub(r"[^\w.-]+", "-", word) for word in words)
 
 
 def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
@@ -42,13 +46,11 @@ def run_stamp(otherwise: str, *, _root_: DictConfig) -> str:
 
 
 def sweep_name(otherwise: str, *, _root_: DictConfig) -> str:
-    """Folder name of a multirun, where the same command finds its cells again; `otherwise` without a sweep.
-
-    That of a search has a digest of all settings: the objectives of its trainings are compared.
-    """
+    """Folder name of a multirun, where its command finds its cells again; `otherwise` without a sweep."""
     choices = _root_.hydra.runtime.choices
     if choices.get("hparams_search"):
-        return f"search_{_joined(_root_, ('hparams_search', 'data', 'category', 'scale'))}_{_digest(_root_)}"
+        name = run_name(_root_=_root_, groups=("hparams_search", "data", "category", "scale"))
+        return f"search_{name}_{_digest(_root_)}"  # the objectives of its trainings are compared
     return choices.get("sweeps") or otherwise
 
 
@@ -67,12 +69,6 @@ def choices_of(config: DictConfig, hydra: DictConfig) -> dict[str, str]:
     return choices
 
 
-def _joined(root: DictConfig, groups: tuple[str, ...]) -> str:
-    choices = choices_of(root, root.hydra)
-    words = [("normals-" if g == "normals" else "") + choices[g] for g in groups if g in choices]
-    return "_".join(re.sub(r"[^\w.-]+", "-", word) for word in words)
-
-
 def _digest(root: DictConfig) -> str:
     """The digest of a composed config; `${hydra:...}`, which only a started job knows, counts as written."""
     written: Any = OmegaConf.to_container(root, resolve=False)
@@ -80,8 +76,6 @@ def _digest(root: DictConfig) -> str:
     settings = deciding(written)
     for key, text in settings.items():
         if "${" in str(text):
-            try:
+            with suppress(OmegaConfBaseException, ValueError):
                 settings[key] = OmegaConf.select(root, key)
-            except (OmegaConfBaseException, ValueError):
-                continue
     return settings_digest(settings)

@@ -13,8 +13,8 @@ NOISE = 1e-6  # excess that 30,000 points a side cannot tell from none, normalis
 def objective(metrics: dict[str, Any]) -> float:
     """What a search lowers: the geometric mean of mean and median excess CD of both roles, in `metrics.json`.
 
-    A factor counts alike in each of the four; a median alone would not see one broken shape of eight. Sources
-    without meshes are judged by the error of distances. Infinite after a failure, where nothing was judged.
+    A median alone would not see one broken shape of eight. Sources without meshes are judged by the error of
+    distances. Infinite after a failure.
     """
     judged = [metrics[role]["shapes"] for role in ROLES if metrics.get(role, {}).get("shapes")]
     errors = [

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sdfhub.multirun.cells import planned_cell
 from sdfhub.multirun.names import register_resolvers
-from sdfhub.report.plan import FAILURE, PlannedCell, enter_cells, read_plan
+from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan
 
 log = logging.getLogger(__name__)
 
@@ -32,24 +32,28 @@ class SweepRecord(Callback):
         register_resolvers()  # a launcher's worker unpickles this before it reads a config
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        if not _trains(config):
+        if config.hydra.job.config_name != "config":  # preparation makes no cells
             return
         words = _words(config)
         asked = [word for word in words if word.startswith(("sweeps=", "hparams_search="))]
+        refused = ""
         if len(asked) > 1 or "," in "".join(asked):  # Hydra would train the cells of none of them
-            _refuse(f"{' '.join(asked)}: one sweep or search a command")
+            refused = f"{' '.join(asked)}: one sweep or search a command"
         try:
-            self._cells = planned_cells(config)
+            self._cells = [] if refused else planned_cells(config)
         except (HydraException, OmegaConfBaseException):
             return  # the sweeper composes the same cells, and its error is worded for the user
         except ValueError as error:
-            _refuse(str(error))
+            refused = " ".join(str(error).split())
+        if refused:
+            print(f"sdfhub: error: {refused}", file=sys.stderr)
+            sys.exit(2)  # what a callback raises, Hydra makes a warning of
         words += [word for word in _words(config, "hydra") if not word.startswith("hydra.mode=")]
         command = shlex.join(["python", "train.py", "-m", *words])
         enter_cells(Path(config.hydra.sweep.dir), self._cells, command)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        if not _trains(config):
+        if config.hydra.job.config_name != "config":  # preparation makes no cells
             return
         from sdfhub.tasks.report import write_report  # here: Hydra imports this file at every start
 
@@ -80,13 +84,3 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
 def _words(config: DictConfig, part: str = "task") -> list[str]:
     """The overrides of the command line as they were typed."""
     return list(map(str, OmegaConf.to_container(config.hydra.overrides[part], resolve=False) or ()))
-
-
-def _refuse(message: str) -> None:
-    print(f"sdfhub: error: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(2)  # what a callback raises, Hydra makes a warning of
-
-
-def _trains(config: DictConfig) -> bool:
-    """Preparation shares the training's config, but makes no cells."""
-    return config.hydra.job.config_name == "config"

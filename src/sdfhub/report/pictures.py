@@ -1,33 +1,30 @@
-"""What a page shows of shapes: contact sheets, and meshes to turn; truth and reconstructions in one frame."""
+"""What a page shows: contact sheets and meshes to turn, truth and reconstructions in one frame; curves."""
 
 import base64
 import io
-import os
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import fast_simplification
+import matplotlib
 import numpy as np
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.data.workers import stream_in_processes
 from sdfhub.geometry.render import render
 from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
-from sdfhub.report.rows import Group
+from sdfhub.report.rows import Group, Row
 from sdfhub.shapes import Frame
 
 PIXELS, PAPER = 208, 0.955
 """Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
 
-FEWEST, MOST = 400, 4000  # triangles of a mesh to turn
-TO_TURN = 4  # shapes to turn for each group, at most
-A_WORKERS_WORTH = 32  # meshes for which it pays to start a process that draws them
+TRIANGLES = 1500  # of a mesh to turn, some 12 bytes each
 FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
 
@@ -40,17 +37,65 @@ class ShownMesh(NamedTuple):
     up: UpAxis
 
 
-def true_mesh(truth: StoredShape | None) -> ShownMesh | None:
-    """The true mesh; None where it cannot be had."""
-    mesh = truth.mesh if truth else None
-    return ShownMesh(mesh.vertices, mesh.faces, truth.up) if truth and mesh else None
+class Tile(NamedTuple):
+    """A picture [S, S, 3] uint8, the text below it or in its place, and its `packed` mesh, to be turned."""
+
+    text: str
+    image: np.ndarray | None = None
+    turning: dict[str, Any] | None = None
+
+
+class Sheet(NamedTuple):
+    """Tiles in rows with labels, under the shapes that they show: role and id."""
+
+    shapes: list[tuple[str, str]]
+    rows: list[tuple[str, list[Tile]]]
+
+    @property
+    def columns(self) -> list[str]:
+        """Captions of the shapes."""
+        return [f"{id} ({role.replace('_', ' ')})" for role, id in self.shapes]
+
+    @property
+    def turning(self) -> list[dict[str, Any]]:
+        """The meshes to turn: a dict a shape with its `name`, its `role` and its meshes, labelled."""
+        shapes = []
+        for column, (role, id) in enumerate(self.shapes):
+            meshes = [(label, tiles[column].turning) for label, tiles in self.rows]
+            panels = [{"label": label} | mesh for label, mesh in meshes if mesh]
+            shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
+        return shapes
+
+
+def contact_sheet_of(group: Group, count: int, find_truth: FindTruth) -> Sheet:
+    """Truth, then each row's first finished cell, for `count` shapes: the paper's figures 2 to 6."""
+    shapes = chosen(group, count)
+    rows = [(row.label, [_shown(row, *shape, find_truth) for shape in shapes]) for row in group.rows]
+    truths = [find_truth(group.first, id) for _, id in shapes] if group.first else []
+    meshes = [ShownMesh(m.vertices, m.faces, t.up) if t and (m := t.mesh) else None for t in truths]
+    if any(meshes):
+        rows.insert(0, ("Ground truth", [_tile("", mesh) if mesh else Tile("no truth") for mesh in meshes]))
+    return Sheet(shapes, rows)
+
+
+def _shown(row: Row, role: str, id: str, find_truth: FindTruth) -> Tile:
+    """What a row has of a shape."""
+    if row.first is None:
+        return Tile(row.state)
+    score = _scores(row.first, role).get(id)
+    if score is None or score.failed:
+        return Tile("no surface" if score else "not judged")
+    mesh = reconstruction(row.first.folder, role, score, find_truth(row.first, id))
+    return _tile(f"CD {score.counted_cd * TABLE_UNIT:.3f}", mesh) if mesh else Tile("no mesh")
+
+
+def _tile(text: str, mesh: ShownMesh) -> Tile:
+    image = render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER)
+    return Tile(text, image, packed(mesh, TRIANGLES))
 
 
 def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape | None) -> ShownMesh | None:
-    """The reconstruction of a shape in a cell's folder; None where there is no surface.
-
-    Where the truth is not there to say what the normalised frame was, the mesh's own extent does.
-    """
+    """The reconstruction of a shape in a cell's folder, or None; without truth its extent is its frame."""
     path = cell / "meshes" / role / f"{score.id}.ply"
     if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
@@ -67,11 +112,7 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
 
 
 def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
-    """A mesh of at most about `triangles`, +z up, as little-endian 16-bit integers in base64.
-
-    Returns:
-        `vertices` and `faces`: counts; `data`: positions times 32767 (int16), then indices (uint16).
-    """
+    """A mesh of at most about `triangles`, +z up; `data`: positions * 32767 (int16), indices (uint16)."""
     vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
     if len(faces) > triangles:
         vertices, faces = fast_simplification.simplify(vertices, faces, 1 - triangles / len(faces))
@@ -82,97 +123,16 @@ def packed(mesh: ShownMesh, triangles: int) -> dict[str, Any]:
     return {"vertices": len(vertices), "faces": len(faces), "data": data}
 
 
-@dataclass
-class Tile:
-    """A picture [S, S, 3] uint8 of what `read` reads, and the text below it or in its place."""
-
-    text: str
-    read: Callable[[], ShownMesh | None] | None = None
-    image: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """Pictures in rows with labels, under columns with captions."""
-
-    columns: list[str]
-    rows: list[tuple[str, list[Tile]]]
-
-
-def contact_sheets(groups: list[Group], count: int, find_truth: FindTruth) -> list[Sheet]:
-    """Truth, then each row of a group, for some shapes, a sheet a group: the paper's figures 2 to 6."""
-    sheets = [_sheet(group, count, find_truth) for group in groups]
-    tiles = [tile for sheet in sheets for _, row in sheet.rows for tile in row if tile.read]
-    readers = [tile.read for tile in tiles]
-    workers = min(os.cpu_count() or 1, len(readers) // A_WORKERS_WORTH)
-    images: Any = stream_in_processes(picture, readers, workers)
-    for tile, image in zip(tiles, images, strict=True):
-        tile.image, tile.text = image, "no mesh" if image is None else tile.text
-    return sheets
-
-
-def _sheet(group: Group, count: int, find_truth: FindTruth) -> Sheet:
-    shown, first = chosen(group, count), group.first
-    truths = [_truth_tile(find_truth(first, id)) for _, id in shown] if first else []
-    rows = [("Ground truth", truths)] if any(tile.read for tile in truths) else []
-    for row in group.rows:
-        absent = "failed" if any(cell.state == "failed" for cell in row.cells) else "missing"
-        cell = row.first
-        rows.append((row.label, [_tile(cell, *s, find_truth) if cell else Tile(absent) for s in shown]))
-    return Sheet([f"{id} ({role.replace('_', ' ')})" for role, id in shown], rows)
-
-
-def _truth_tile(truth: StoredShape | None) -> Tile:
-    return Tile("", partial(true_mesh, truth)) if truth and truth.rows("faces") else Tile("no truth")
-
-
-def _tile(cell: Cell, role: str, id: str, find_truth: FindTruth) -> Tile:
-    score = _scores(cell, role).get(id)
-    if score is None or score.failed:
-        return Tile("no surface" if score else "not judged")
-    read = partial(reconstruction, cell.folder, role, score, find_truth(cell, id))
-    return Tile(f"CD {score.counted_cd * TABLE_UNIT:.3f}", read)
-
-
-def picture(read_mesh: Callable[[], ShownMesh | None]) -> np.ndarray | None:
-    """[S, S, 3] uint8 of a mesh from the usual side; None without one."""
-    mesh = read_mesh()
-    return render(mesh.vertices, mesh.faces, PIXELS, up=mesh.up, background=PAPER) if mesh else None
-
-
-def turning_meshes(group: Group, count: int, room: int, find_truth: FindTruth) -> list[dict]:
-    """Some shapes of a group, truth and rows, decimated to some `room` bytes for the viewer of the page.
-
-    Returns:
-        A dict a shape: `name`, `role` and `panels`, its meshes as `packed` with a `label` each.
-    """
-    shown, cells = (
-        chosen(group, min(count, TO_TURN)),
-        {row.label: row.first for row in group.rows if row.first},
-    )
-    triangles = room // max(1, len(shown) * (len(cells) + 1) * 12)  # some 12 bytes each, as base64
-    triangles = min(MOST, max(FEWEST, triangles))
-    shapes = []
-    for role, id in shown:
-        readers = {label: _tile(cell, role, id, find_truth).read for label, cell in cells.items()}
-        readers = {"Ground truth": _truth_tile(find_truth(next(iter(cells.values())), id)).read} | readers
-        meshes = {label: read() for label, read in readers.items() if read}
-        panels = [{"label": label} | packed(mesh, triangles) for label, mesh in meshes.items() if mesh]
-        shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
-    return shapes
-
-
 def chosen(group: Group, count: int) -> list[tuple[str, str]]:
     """Role and id of the shapes to show: the first training ones, and up to a third held out."""
     train, held_out = (list(_scores(group.first, role)) if group.first else [] for role in ROLES)
     held_out = held_out[: max(count // 3, count - len(train))]
-    train = train[: count - len(held_out)]
-    return [("train", id) for id in train] + [("held_out", id) for id in held_out]
+    return [("train", id) for id in train[: count - len(held_out)]] + [("held_out", id) for id in held_out]
 
 
 def _scores(cell: Cell, role: str) -> dict[str, ShapeScore]:
     """The scores of a role by id; {} where shapes have no surfaces to be judged by."""
-    return {s.id: s for s in cell.result.shapes.get(role, []) if isinstance(s, ShapeScore)}
+    return {s.id: s for s in cell.scores.shapes.get(role, []) if isinstance(s, ShapeScore)}
 
 
 def picture_uri(image: np.ndarray) -> str:
@@ -180,3 +140,43 @@ def picture_uri(image: np.ndarray) -> str:
     content = io.BytesIO()
     Image.fromarray(image).save(content, "WEBP", quality=82)
     return "data:image/webp;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "sdfhub", "font.size": 9}
+STYLE |= {"axes.grid": True, "grid.color": "#e2e4e8", "axes.spines.top": False, "axes.spines.right": False}
+
+
+@matplotlib.rc_context(STYLE)
+def loss_chart(group: Group) -> str | None:
+    """Loss of signed distances by step, a line a seed, as an SVG's data URI; None without any."""
+    figure = Figure((7.6, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for index, row in enumerate(group.rows):
+        label = (row.label if len(row.label) < 60 else f"{row.label[:58]}…").replace(
+            "$", r"\$"
+        )  # no formulas
+        for curve in filter(None, (loss_curve(cell.folder) for cell in row.done)):
+            line = "-" if row.normals == "on" else "--"
+            axes.plot(*zip(*curve, strict=True), color=f"C{index % 10}", ls=line, lw=1.3, label=label)
+            label = ""
+    if not axes.lines:
+        return None
+    axes.set(xlabel="step", ylabel="clamped L1", yscale="log")
+    axes.legend(frameon=False, fontsize=8)
+    content = io.BytesIO()
+    figure.savefig(content, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(content.getvalue()).decode()
+
+
+def loss_curve(run: Path, tag: str = "loss/sdf", points: int = 240) -> list[tuple[int, float]]:
+    """A logged value by step where above 0, thinned out to so many points; [] where it cannot be read."""
+    folder = run / "tensorboard"
+    if not folder.resolve().is_relative_to(run.resolve()):
+        return []
+    try:
+        keep = {"scalars": 0, "images": 1, "tensors": 1}  # of each tag; 0 is all
+        scalars = EventAccumulator(str(folder), size_guidance=keep).Reload().Scalars(tag)
+    except Exception:  # no such folder or tag, or a file that a kill cut off: a picture less, no error
+        return []
+    curve = sorted({event.step: event.value for event in scalars if 0 < event.value < 1e12}.items())
+    return curve[:: max(1, -(-len(curve) // points))]

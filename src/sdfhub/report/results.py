@@ -1,10 +1,13 @@
-"""What a cell left behind, read as plain data and checked: its scores, its cost, or why there are none.
+"""A sweep's folder as plain data: the cells that `sweep.json` lists, and what each has left behind, checked.
 
-Nothing in a cell's files is run, and no link is followed out of its folder.
+A cell is one training. Its folder is named after all its settings: cells of another scale, category or seed
+lie side by side, and a cell whose settings have changed since is superseded, not overwritten. Nothing in a
+cell's files is run, and no link is followed out of its folder.
 """
 
 import json
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,26 +15,84 @@ import yaml
 from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import is_locked
-from sdfhub.report.plan import FAILURE, PlannedCell, first_fault, read_plan
+from sdfhub.locks import locked
 from sdfhub.settings import flat
+from sdfhub.whole_file import write_whole
 
+PLAN, FAILURE = "sweep.json", "failed.json"
 ROLES = ("train", "held_out")
-
 TABLE_UNIT = 1e3  # Chamfer distances and errors of distances are shown times 10^3
+
+Text = Annotated[str, StringConstraints(max_length=2000)]
+FolderName = Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_length=255)]
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Name = Annotated[str, StringConstraints(max_length=300)]
 
 
+class PlannedCell(BaseModel, frozen=True, extra="forbid", strict=True):
+    """One cell as its command line described it."""
+
+    folder: FolderName  # below the sweep's
+    choices: dict[Text, Text]  # option by config group, `sweeps` among them
+    settings: dict[Text, Text]  # values set beside the groups and the seed, by dotted key
+    seed: int
+
+    @property
+    def identity(self) -> tuple[tuple, tuple, int]:
+        """Choices, settings and seed: two cells that agree in them are one, under old and new defaults."""
+        return tuple(sorted(self.choices.items())), tuple(sorted(self.settings.items())), self.seed
+
+
+class Plan(BaseModel, extra="forbid"):
+    """The content of `sweep.json`: the cells in the order of their commands, and these."""
+
+    version: Literal[1] = 1
+    cells: list[PlannedCell] = []
+    commands: list[Text] = []
+
+
+def read_plan(sweep: Path) -> Plan:
+    """What a sweep's folder consists of; refuses one that is none, or whose `sweep.json` is broken."""
+    try:
+        return Plan.model_validate_json((sweep / PLAN).read_bytes())
+    except OSError as error:
+        raise SdfhubError(f"{sweep}: not the folder of a multirun: it has no {PLAN}") from error
+    except ValidationError as error:
+        raise SdfhubError(f"{sweep / PLAN}: {first_fault(error)}") from error
+
+
+def first_fault(error: ValidationError) -> str:
+    """Where the first fault of checked data lies, and what it is."""
+    fault = error.errors()[0]
+    return f"{'.'.join(map(str, fault['loc']))}: {fault['msg'].lower()}"
+
+
+def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
+    """Adds cells to `sweep.json`, and the command that asked for them. Safe side by side.
+
+    Cells of other settings are replaced; of those with one folder the one that names fewest defaults stays.
+    """
+    sweep.mkdir(parents=True, exist_ok=True)
+    with locked(sweep / ".lock"):
+        old = read_plan(sweep) if (sweep / PLAN).exists() else Plan()
+        by_folder: dict[str, PlannedCell] = {}
+        for cell in {cell.identity: cell for cell in (*old.cells, *cells)}.values():
+            rival = by_folder.setdefault(cell.folder, cell)
+            by_folder[cell.folder] = min(rival, cell, key=lambda planned: len(planned.settings))
+        commands = dict.fromkeys([*old.commands, *([command[:2000]] if command else [])])
+        plan = Plan(cells=list(by_folder.values()), commands=list(commands))
+        write_whole(sweep / PLAN, plan.model_dump_json(indent=1))
+
+
 class ShapeScore(BaseModel, frozen=True):
-    """One judged shape: Chamfer distance, its noise floor, what a failure counts as, agreement of normals."""
+    """One judged shape."""
 
     id: Name
     cd: Number | None
     floor: Number
-    cd_penalty: Number
-    failed: bool
+    cd_penalty: Number  # the Chamfer distance of a single point
+    failed: bool  # the field has no surface
     normal_consistency: Number | None = None
 
     @property
@@ -53,9 +114,6 @@ class DistanceScore(BaseModel, frozen=True):
     sign_accuracy: Number
 
 
-RoleScores = list[ShapeScore] | list[DistanceScore]
-
-
 class Training(BaseModel, frozen=True):
     """The cost of a training, and versions and hardware by name."""
 
@@ -67,24 +125,22 @@ class Training(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a finished cell."""
+    """The scores of a finished cell; nothing is in those of another."""
 
-    shapes: dict[str, RoleScores]  # by role
-    training: Training
-    trained_on: int  # shapes, without augmented copies
-    config: dict[str, Any]  # of config.yaml
+    shapes: dict[str, list[ShapeScore] | list[DistanceScore]] = field(default_factory=dict)  # by role
+    training: Training = field(default_factory=lambda: Training(seconds=0, steps=0, parameters=0))
+    trained_on: int = 0  # shapes, without augmented copies
+    config: dict[str, Any] = field(default_factory=dict)  # of config.yaml
 
     def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
-        costs: dict[str, float] = self.training.model_dump(exclude={"made_with"})
-        costs["trained_on"] = self.trained_on
+        costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
         settings = flat(self.config)
         try:
-            costs["epochs"] = float(int(settings["trainer.max_epochs"]))
+            costs["epochs"] = int(settings["trainer.max_epochs"])
             rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
             shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
-            samples = shapes * int(settings["data.loader.samples_per_shape"])
-            costs["samples"] = float(samples * self.training.steps)
+            costs["samples"] = shapes * int(settings["data.loader.samples_per_shape"]) * self.training.steps
         except (KeyError, TypeError, ValueError, OverflowError):
             pass  # a loader of the user's own
         return costs
@@ -97,22 +153,12 @@ class Cell:
     plan: PlannedCell
     folder: Path
     state: Literal["done", "failed", "missing"]
-    reason: str = ""  # why there are no scores
-    scores: Scores | None = None  # of a cell that is done
-
-    @property
-    def result(self) -> Scores:
-        """The scores of a cell that is done."""
-        assert self.scores is not None
-        return self.scores
+    reason: str = ""  # why it is not done
+    scores: Scores = Scores()
 
 
 def read_sweep(sweep: Path) -> list[Cell]:
-    """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing.
-
-    Raises:
-        SdfhubError: not a sweep's folder.
-    """
+    """All planned cells of a sweep's folder; a broken one carries its reason and ends nothing."""
     return [_read_cell(plan, sweep / plan.folder) for plan in read_plan(sweep).cells]
 
 
@@ -120,46 +166,37 @@ def _read_cell(plan: PlannedCell, folder: Path) -> Cell:
     try:
         if not folder.resolve().is_relative_to(folder.parent.resolve()):
             return Cell(plan, folder, "failed", "its folder is a link out of the sweep")
-        if is_locked(folder / ".lock"):
-            return Cell(plan, folder, "missing", "is being trained")
         if (folder / FAILURE).exists():
-            return Cell(plan, folder, "failed", str(_loaded(folder, FAILURE).get("reason"))[:500])
+            return Cell(plan, folder, "failed", str(_read(folder, FAILURE).get("reason"))[:500])
         if not (folder / "metrics.json").exists():
             begun = (folder / "config.yaml").exists()
-            return Cell(plan, folder, "missing", "was interrupted" if begun else "has not been run")
+            return Cell(plan, folder, "missing", "is not finished" if begun else "has not been run")
         return Cell(plan, folder, "done", scores=read_scores(folder))
     except (SdfhubError, OSError) as error:
         return Cell(plan, folder, "failed", str(error))
 
 
 def read_scores(folder: Path) -> Scores:
-    """The scores of a finished run's folder.
-
-    Raises:
-        SdfhubError: a file is missing, broken or not what training writes.
-    """
-    metrics, shapes = _loaded(folder, "metrics.json"), {}
+    """The scores of a finished run's folder; refuses files that are not what training writes."""
+    metrics, shapes = _read(folder, "metrics.json"), {}
     for role in filter(metrics.get, ROLES):
-        rows = _checked(dict[str, Any], metrics[role], f"metrics.json: {role}").get("shapes")
+        rows = _checked(dict, metrics[role], f"metrics.json: {role}").get("shapes")
         kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
         shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
     training = _checked(Training, metrics.get("training"), "metrics.json: training")
-    trained_on = _checked(list[Name], _loaded(folder, "split.json").get("train"), "split.json: train")
-    return Scores(shapes, training, len(trained_on), _loaded(folder, "config.yaml"))
+    trained_on = _checked(list[Name], _read(folder, "split.json").get("train"), "split.json: train")
+    return Scores(shapes, training, len(trained_on), _read(folder, "config.yaml"))
 
 
-def _loaded(folder: Path, name: str) -> dict[str, Any]:
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+def _read(folder: Path, name: str) -> dict[str, Any]:
+    if not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise SdfhubError(f"{name}: is a link out of its folder")
     try:
-        text = path.read_text(encoding="utf-8")
-        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        text = (folder / name).read_text(encoding="utf-8")
+        content = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         raise SdfhubError(f"{name}: cannot be read ({type(error).__name__})") from error
-    if not isinstance(content, dict):
-        raise SdfhubError(f"{name}: not what training writes")
-    return content
+    return _checked(dict, content, name)
 
 
 def _checked(kind: Any, content: Any, name: str) -> Any:

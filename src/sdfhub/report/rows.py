@@ -20,14 +20,15 @@ JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
 """Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
 
 MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
-PLACES = ["method", "normals", "detail", "label", "cell", "seed", "role", "shape"]
+NAMES = ["method", "normals", "detail", "label"]
+PLACES = [*JUDGING_GROUPS, "settings", *NAMES, "cell", "seed", "role", "shape"]
 SCORED = ["cd", "floor", "cd_penalty", "failed", "normal_consistency", "sdf_error", "sign_accuracy"]
 COSTS = ["trained_on", "parameters", "epochs", "steps", "samples", "seconds"]
 
 NONE = "–"  # what tables show where there is nothing
 
 
-@dataclass(frozen=True)
+@dataclass
 class Row:
     """A method in a group of comparable cells, one a seed."""
 
@@ -36,62 +37,45 @@ class Row:
     detail: str  # what else tells the row from others of its method; mostly empty
     cells: list[Cell]
 
-    @property
-    def label(self) -> str:
-        """Method, normals unless it is DeepSDF without them, and detail, in one line."""
+    def __post_init__(self) -> None:
         words = {"on": " + normals", "off": ", no normals" if self.method != "DeepSDF" else ""}
-        return self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
-
-    @property
-    def done(self) -> list[Cell]:
-        """The finished cells."""
-        return [cell for cell in self.cells if cell.scores]
-
-    @property
-    def first(self) -> Cell | None:
-        """The first finished cell."""
-        return next(iter(self.done), None)
-
-    @property
-    def searched(self) -> str:
-        """What search the settings come from, as the experiment's config says."""
-        return str(self.first.result.config.get("searched") or "no")[:200] if self.first else NONE
+        self.label = self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
+        self.done = [cell for cell in self.cells if cell.state == "done"]
+        self.first = self.done[0] if self.done else None
+        # what stands for a row without finished cells, and what search its settings come from
+        self.state = "failed" if any(cell.state == "failed" for cell in self.cells) else "missing"
+        self.names = {name: getattr(self, name) for name in NAMES}
+        self.searched = str(self.done[0].scores.config.get("searched") or "no")[:200] if self.done else NONE
 
 
-@dataclass(frozen=True)
+@dataclass
 class Group:
     """Rows that may be compared: the same sweep, shapes, scale and way of judging."""
 
     judging: dict[str, str]  # options of JUDGING_GROUPS, values of JUDGING_SETTINGS on the command line
     rows: list[Row]  # in the order of the commands, each with normals first
 
-    @property
-    def first(self) -> Cell | None:
-        """The first finished cell."""
-        return next((row.first for row in self.rows if row.first), None)
-
-    @property
-    def title(self) -> str:
-        """`chairs, data=open, scale=cpu, fit=gauss_newton, evaluate=paper, trained on 20`."""
-        return ", ".join(self.title_parts)
-
-    @property
-    def title_parts(self) -> list[str]:
-        """The words of the title, the category first."""
+    def __post_init__(self) -> None:
+        done = [cell for row in self.rows for cell in row.done]
+        self.first = done[0] if done else None
+        self.settings = [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
+        self.place = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}  # columns of a CSV file
+        self.place["settings"] = ";".join(self.settings)
+        counts = sorted({cell.scores.trained_on for cell in done})
+        ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]
-        counts = {cell.result.trained_on for row in self.rows for cell in row.done}
-        ends = " to ".join(map(str, sorted({min(counts), max(counts)}))) if counts else "nothing yet"
-        return [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
+        # words such as `chairs`, `data=open`, `scale=cpu`, `evaluate=paper`, `trained on 20`
+        self.title = [self.judging.get("category", "all"), *parts, f"trained on {ends}"]
 
     @cached_property
     def shapes(self) -> pd.DataFrame:
         """MEASURES of each judged shape, distances times 10^3; `cd` is that of a point where nothing is."""
         records = [
-            vars(row) | {"label": row.label, "cell": cell.plan.folder, "seed": cell.plan.seed}
+            self.place | row.names | {"cell": cell.plan.folder, "seed": cell.plan.seed}
             | {"role": role, "shape": shape.id} | dict(shape)
             for row in self.rows
             for cell in row.done
-            for role, shapes in cell.result.shapes.items()
+            for role, shapes in cell.scores.shapes.items()
             for shape in shapes
         ]  # fmt: skip
         frame = pd.DataFrame(records, columns=[*PLACES, *SCORED]).astype(dict.fromkeys(SCORED, float))
@@ -113,7 +97,7 @@ class Group:
     @cached_property
     def costs(self) -> pd.DataFrame:
         """COSTS by label, over seeds as in `statistics`."""
-        records = [{"label": row.label} | cell.result.costs() for row in self.rows for cell in row.done]
+        records = [{"label": row.label} | cell.scores.costs() for row in self.rows for cell in row.done]
         frame = pd.DataFrame(records, columns=["label", *COSTS]).astype(dict.fromkeys(COSTS, float))
         return over_seeds(frame, ["label"])
 
@@ -128,7 +112,7 @@ def over_seeds(cells: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 def settings_of(cell: Cell) -> dict[str, str]:
     """Settings of a finished cell by dotted key that can change its result, but for the seed's."""
-    settings = deciding(cell.result.config).items()
+    settings = deciding(cell.scores.config).items()
     return {str(k): str(v)[:200] for k, v in settings if k not in (*OF_THE_SEED, "searched")}
 
 
@@ -168,10 +152,10 @@ def _rows(cells: list[Cell]) -> list[Row]:
         own = dict(pair for pair in plan.settings.items() if pair not in shared)
         own |= {key: plan.choices.get(key, NONE) for key in differing(namesakes)}
         parts = _by_settings(members)
-        changed = differing([settings_of(part[0]) for part in parts]) if len(parts) > 1 else {}
+        changed = differing([settings_of(part[0]) for part in parts])
         for number, part in enumerate(parts):
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
-            detail = ", ".join(f"{key}={_short(value)}" for key, value in words.items())
+            detail = ", ".join(f"{key}={value}" for key, value in words.items())
             row = Row(*_name(plan.choices), detail, part)
             twins = sum(row.label == rival.label for rival in rows)  # labels name rows: no two are equal
             rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
@@ -181,13 +165,11 @@ def _rows(cells: list[Cell]) -> list[Row]:
 
 def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
     """Seeds of one command line, apart where defaults changed between them; unfinished ones with the last."""
-    parts: dict[tuple, list[Cell]] = {}
-    for cell in cells:
-        if cell.scores:
-            parts.setdefault(tuple(settings_of(cell).items()), []).append(cell)
-    lists = list(parts.values()) or [[]]
-    lists[-1].extend(cell for cell in cells if not cell.scores)
-    return lists
+    parts: dict[str, list[Cell]] = {}
+    for cell in sorted(cells, key=lambda cell: cell.state != "done"):
+        key = str(settings_of(cell)) if cell.state == "done" else next(reversed(parts), "")
+        parts.setdefault(key, []).append(cell)
+    return list(parts.values())
 
 
 def _name(choices: dict[str, str]) -> tuple[str, str]:
@@ -198,24 +180,15 @@ def _name(choices: dict[str, str]) -> tuple[str, str]:
     return PREFIXES.get(encoding, f"{encoding.upper()}/") + method, choices.get("normals", "?")
 
 
-def _short(value: str) -> str:
-    """A number of more than six characters to five digits: a search draws them with sixteen."""
-    try:
-        return f"{float(value):.5g}" if len(value) > 6 else value
-    except ValueError:
-        return value
-
-
 def table_csv(groups: list[Group]) -> str:
     """Every row of every group as numbers: a line a role, `Group.statistics` and `Group.costs` in it."""
     frames = [pd.DataFrame({"label": []})]
     for group in groups:
         rows = [
-            _place(group) | vars(row) | {"label": row.label, "searched": row.searched}
-            | {"cells": len(row.cells), "role": role}
+            group.place | row.names | {"cells": len(row.cells), "searched": row.searched, "role": role}
             for row in group.rows
             for role in ROLES
-        ]  # fmt: skip
+        ]
         numbers = pd.DataFrame(rows).join(group.statistics, on=["label", "role"])
         frames.append(numbers.join(group.costs, on="label"))
     return pd.concat(frames[1:] or frames).to_csv(index=False, float_format="%.9g")
@@ -223,13 +196,6 @@ def table_csv(groups: list[Group]) -> str:
 
 def shapes_csv(groups: list[Group]) -> str:
     """Every judged shape of every cell as numbers, distances times 10^3; no `cd` without a surface."""
-    frames = [pd.DataFrame([_place(group)]).merge(group.shapes, how="cross") for group in groups]
-    frame = pd.concat(frames or [pd.DataFrame({"cd": [], "no_surface": []})])
+    frame = pd.concat([group.shapes for group in groups or [Group({}, [])]])
     frame["cd"] = frame["cd"].where(frame["no_surface"] != 1)
     return frame.to_csv(index=False, float_format="%.9g")
-
-
-def _place(group: Group) -> dict[str, str]:
-    """What tells a group from others, by column of a CSV file."""
-    settings = [f"{key}={value}" for key, value in group.judging.items() if key not in JUDGING_GROUPS]
-    return {name: group.judging.get(name, "") for name in JUDGING_GROUPS} | {"settings": ";".join(settings)}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import pandas as pd
 
 from sdfhub.report.results import ROLES, Cell
-from sdfhub.report.rows import NONE, Group, Row, differing, settings_of
+from sdfhub.report.rows import NONE, Group, differing, settings_of
 
 TITLES = {"train": "Training shapes", "held_out": "Held-out shapes"}
 
@@ -20,23 +20,16 @@ DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_medi
 DISTANCES |= {"signs right": "sign_accuracy_mean"}
 """Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
 
-LOWER_IS_BETTER = ("cd_mean", "cd_median", "excess_mean", "excess_median")
-
 ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
     "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
-    "between those of reconstruction and truth, of shapes with a surface. The floor is a mean over shapes: "
-    "a median CD may lie below it. ± is a 95% confidence interval over seeds (Student's t); bold: the "
-    "lowest, however near others are."
+    "between those of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t)."
 )
 ABOUT_DISTANCES = (
-    "The source holds no meshes, so there is no Chamfer distance. |f - d| times 10³: mean over a shape's "
-    "samples near its surface, then over shapes; signs right: share of samples."
+    "No meshes, no CD. |f - d| times 10³, over samples near a shape's surface, then over shapes."
 )
 ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
-ABOUT_COSTS = (
-    "Samples are signed distances drawn in all. Times compare on one machine with nothing beside it."
-)
+ABOUT_COSTS = "Samples are signed distances drawn in all. Times compare on one idle machine."
 ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
 
 
@@ -53,7 +46,7 @@ class Table:
 
 def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
-    kinds = [("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES)]
+    kinds = (("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES))
     scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
     return [table for table in (*scores, _settings(group), _costs(group), _absent(group)) if table]
 
@@ -62,32 +55,31 @@ def overview(groups: list[Group]) -> list[Table]:
     """Mean and median excess of every row in every group, a table a role; none where there is one group."""
     if len(groups) < 2:
         return []
-    common = set.intersection(*(set(group.title_parts) for group in groups))
+    common = set.intersection(*(set(group.title) for group in groups))
     labels = list(dict.fromkeys(row.label for group in groups for row in group.rows))
     overviews = []
     for role in ROLES:
-        columns = [pd.Series(labels, name="method")]
+        frame = pd.DataFrame({"method": labels})
         for group in groups:
-            parts = [part for k, part in enumerate(group.title_parts) if k == 0 or part not in common]
+            column = ", ".join(part for k, part in enumerate(group.title) if k == 0 or part not in common)
             lines = _lines(group, role).reindex(labels)
-            statistics = ("excess_mean", "excess_median")
-            pairs = zip(*(_texts(lines, name, interval=False) for name in statistics), strict=True)
+            means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = [f"{mean}, {median}{n}" for (mean, median), n in zip(pairs, seeds, strict=True)]
-            column = pd.Series(texts, name=", ".join(parts))
-            columns.append(column.mask(lines["excess_mean"].isna().to_numpy(), NONE))
-        table = Table(f"{TITLES[role]}, excess", pd.concat(columns, axis=1), ABOUT_OVERVIEW)
-        overviews += [table] if (table.frame.iloc[:, 1:] != NONE).any(axis=None) else []
+            texts = ["{}, {}{}".format(*parts) for parts in zip(means, medians, seeds, strict=True)]
+            texts = [NONE if text == f"{NONE}, {NONE}" else text for text in texts]
+            frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
+        if (frame.iloc[:, 1:] != NONE).any(axis=None):
+            overviews.append(Table(f"{TITLES[role]}, excess", frame, ABOUT_OVERVIEW))
     return overviews
 
 
 def origin(commands: list[str], cells: list[Cell]) -> Table:
     """How a sweep was made: its commands, how long it trained, versions and hardware."""
-    trainings = [cell.scores.training for cell in cells if cell.scores]
-    spent = duration(sum(training.seconds for training in trainings))
-    made_with = Counter(", ".join(f"{k} {v}" for k, v in run.made_with.items()) for run in trainings)
+    done = [cell.scores.training for cell in cells if cell.state == "done"]
+    made_with = Counter(", ".join(f"{k} {v}" for k, v in training.made_with.items()) for training in done)
+    spent = duration(sum(training.seconds for training in done))
     lines = [["command", command] for command in commands]
-    lines.append(["trainings", f"{len(trainings)} of {len(cells)} done, {spent} in all"])
+    lines += [["trainings", f"{len(done)} of {len(cells)} done, {spent} in all"]]
     lines += [[f"{count} of them with", words or "not written down"] for words, count in made_with.items()]
     return Table("How it was made", pd.DataFrame(lines, columns=["what", "which"]), prose=True)
 
@@ -111,7 +103,7 @@ def _scores(group: Group, role: str, title: str, quantities: dict[str, str], abo
     best = {
         (int(row), column)
         for column, quantity in enumerate(quantities.values(), start=1)
-        if len(lines) > 1 and quantity in LOWER_IS_BETTER
+        if len(lines) > 1 and quantity.startswith(("cd", "excess"))
         for row in rivals.index[rivals[quantity] == rivals[quantity].min()]
     }
     return Table(TITLES[role] + title, _frame(group, columns), about, best)
@@ -145,19 +137,14 @@ def _absent(group: Group) -> Table | None:
 def _frame(group: Group, columns: dict[str, list[str]]) -> pd.DataFrame:
     """Columns between the labels of the rows and what the rows rest on: seeds, and a search or none."""
     columns = {"method": [row.label for row in group.rows]} | columns
-    columns |= {"seeds": list(map(_seeds, group.rows)), "searched": [row.searched for row in group.rows]}
-    return pd.DataFrame(columns)
-
-
-def _seeds(row: Row) -> str:
-    failed = any(cell.state == "failed" for cell in row.cells)
-    return f"{len(row.done)}/{len(row.cells)}" if row.done else "failed" if failed else "missing"
+    seeds = [f"{len(row.done)}/{len(row.cells)}" if row.done else row.state for row in group.rows]
+    return pd.DataFrame(columns | {"seeds": seeds, "searched": [row.searched for row in group.rows]})
 
 
 def _texts(lines: pd.DataFrame, quantity: str, interval: bool = True) -> list[str]:
     """A column as text with its intervals, four places below 10 and two above."""
     texts = []
-    for mean, half in zip(lines[quantity], lines[f"{quantity}_ci95"], strict=True):
+    for mean, half in lines[[quantity, f"{quantity}_ci95"]].to_numpy():
         places = 4 if abs(mean) < 10 else 2
         spread = f" ± {half:.{places}f}" if interval and half >= 0.5 * 10**-places else ""
         texts.append(NONE if pd.isna(mean) else f"{mean:.{places}f}{spread}")

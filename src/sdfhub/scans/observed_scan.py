@@ -7,10 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from sdfhub.data.loading.batches import signed_samples
 from sdfhub.data.preparation.sampling import prepare_mesh
 from sdfhub.data.preparation.settings import Preparation
-from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape, signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.scan import LEAST, Scan

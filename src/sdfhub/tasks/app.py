@@ -18,16 +18,10 @@ Task = Callable[[DictConfig], float | None]
 
 
 def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> None:
-    """Composes `config_name` with the command line's overrides and runs `task` on it.
+    """Composes `config_name` with the words of the command line and runs `task` on it.
 
     Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C; 1 where
     Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
-
-    Args:
-        task: given each composed config.
-        config_name: a YAML of conf/.
-        positional: keys that words without `=` stand for, in their order; a last one that ends with `...`
-            takes all that are left.
     """
     sys.argv[1:] = words_to_overrides(sys.argv[1:], positional)
     register_resolvers()

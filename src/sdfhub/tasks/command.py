@@ -16,17 +16,14 @@ TASKS = {
     "sample": ("run", "new shapes of a space: sdfhub sample RUN n=8"),
     "neighbours": ("run of", "the shapes most like one: sdfhub neighbours RUN ID (or a scan)"),
     "view": ("run", "a page on this machine to see, move, mix and fit shapes: sdfhub view RUN"),
-    "import-deepsdf": (
-        "folder",
-        "a run of DeepSDF becomes ours: sdfhub import-deepsdf EXPERIMENT",
-    ),
+    "import-deepsdf": ("folder", "a run of DeepSDF becomes ours: sdfhub import-deepsdf EXPERIMENT"),
     "reconstruct": ("run scans...", "finds the shapes behind scans: sdfhub reconstruct RUN scan.ply"),
     "report": ("sweep", "tables and a page of a sweep: sdfhub report outputs/sweeps/table_small"),
 }
 """The keys that a task's words without `=` stand for, and what it does.
 
-The task is the function of its name in the module of its name. Its YAML in conf/ has its name too; that of
-`train` is `config.yaml`.
+The task is the function of its name, in the module of its name or in `gallery`. Its YAML in conf/ has its
+name too; that of `train` is `config.yaml`.
 """
 
 
@@ -48,10 +45,11 @@ def main() -> None:
         sys.exit(2)
     del sys.argv[1]
     name = task.replace("-", "_")
+    module = "gallery" if name in ("interpolate", "sample", "neighbours") else name
     gc.disable()  # what imports make stays: looking it over for garbage is a fifth of a start
     from sdfhub.tasks.app import run_task
 
-    function = getattr(importlib.import_module(f"sdfhub.tasks.{name}"), name)
+    function = getattr(importlib.import_module(f"sdfhub.tasks.{module}"), name)
     gc.freeze()
     gc.enable()
     run_task(function, "config" if task == "train" else name, TASKS[task][0].split())

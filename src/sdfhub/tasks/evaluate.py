@@ -2,10 +2,12 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
 from sdfhub.composition import instantiate, plain
+from sdfhub.data.loading import SdfDataModule
 from sdfhub.data.sources import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.described import check
@@ -22,14 +24,12 @@ def evaluate(config: DictConfig) -> None:
     run = Path(str(config.run))
     out = beside(str(run), config.out, "evaluation")
     evaluation = instantiate(config.evaluate, "evaluate")
-    trained, roles_then = read_run(run)
-    trust = config.trust or ()
-    space, data = load(run, trust=trust), data_of(trained, trust)
+    trained, data, roles_then = data_again(run, config)
+    space = load(run, trust=config.trust or ())
     then, is_same = data.source, True
     if config.data.get("source"):  # another source, or the same with other settings
         data.source = instantiate(config.data.source, "data.source")
         is_same = plain(config.data)["source"] == trained["data"]["source"]
-    data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
     # under other settings (categories, count) a source of the same name offers shapes of the same ids
     seen = set(roles_then["train"]) if data.source.name == then.name else set()
     roles = choose_shapes(data.source, roles_then if is_same else {"train": [], "held_out": []}, seen, config)
@@ -40,36 +40,31 @@ def evaluate(config: DictConfig) -> None:
     evaluate_model(space.decoder, space.codes, space.delta, train, held_out, evaluation, out)
 
 
+def data_again(run: Path, config: DictConfig) -> tuple[dict[str, Any], SdfDataModule, dict[str, list[str]]]:
+    """A run's config, its data with the store and workers of a task's `config`, and its ids by role."""
+    trained, roles = read_run(run)
+    data = data_of(trained, config.trust or ())
+    data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
+    return trained, data, roles
+
+
 def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str], config: DictConfig) -> Split:
-    """The shapes to judge: those of the run, those that `shapes` names, or `held_out` unseen ones.
-
-    Args:
-        source: offers them.
-        trained: ids by role in the run; none where another source or other settings of it are judged.
-        seen: ids that were trained on: never judged as unseen ones.
-        config: the task's.
-
-    Raises:
-        SdfhubError: a shape that the source does not have.
-    """
+    """The shapes to judge: the run's (`trained`), those that `shapes` names, or others, none of `seen`."""
     offered = {shape.id: shape for shape in source.shapes()}
     ids = check(plain(config)["shapes"], list[str] | None, "shapes")
     count = check(config.held_out, int | None, "held_out")
-    unseen = [id for id in offered if id not in seen]
-    train = trained["train"]
+    train, unseen = trained["train"], [id for id in offered if id not in seen]
     if ids is not None:
         train, unseen = [id for id in ids if id in train], [id for id in ids if id not in train]
         if trained_on := seen.intersection(unseen):
-            raise SdfhubError(
-                f"shapes: {min(trained_on)} was trained on; leave out data= to judge it as a training shape"
-            )
-    elif trained["train"] and count is None:
-        unseen = trained["held_out"]
+            hint = "leave out data= to judge it as a training shape"
+            raise SdfhubError(f"shapes: {min(trained_on)} was trained on; {hint}")
     elif count is not None:
         unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).held_out]
+    elif train:
+        unseen = trained["held_out"]
     for id in (*train, *unseen):
         if id not in offered:
-            raise SdfhubError(
-                f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
-            )
+            has = ", ".join(list(offered)[:3])
+            raise SdfhubError(f"shapes: {source.name} has no shape {id!r}; it has {has} ...")
     return Split([offered[id] for id in train], [offered[id] for id in unseen])

@@ -1,15 +1,13 @@
 """Task `export`: a space as one file, as a function for other runtimes, or as meshes."""
 
 import io
-import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from omegaconf import DictConfig
+from pydantic import Field
 from torch.export import Dim
 from tqdm import tqdm
 
@@ -48,20 +46,19 @@ def export(config: DictConfig) -> None:
 def export_meshes(config: DictConfig, folder: Path) -> None:
     """Writes the meshes of all or of chosen shapes, each in its source's frame where that is known."""
     suffix = check(config.format, Literal[FORMATS], "format")
-    chosen = check(plain(config)["shapes"], list[str | int] | str | int | None, "shapes")
+    shapes = Annotated[list[str | int], Field(min_length=1)] | str | int | None
+    chosen = check(plain(config)["shapes"], shapes, "shapes")
     chosen = [chosen] if isinstance(chosen, str | int) else chosen
     space = load(config.run, trust=config.trust or ())
-    rows = range(len(space.ids)) if chosen is None else [space.row(shape) for shape in chosen]
-    if not rows:
-        raise SdfhubError("shapes=[]: name at least one, or null for all")
+    ids = [space.ids[space.row(shape)] for shape in chosen or space.ids]
     empty = []
-    meshes = tqdm(space.meshes(list(rows), config.resolution), total=len(rows), unit="shape", disable=None)
-    for row, (vertices, faces) in zip(rows, meshes, strict=True):
-        write_mesh(vertices, faces, folder / "meshes" / f"{space.ids[row]}.{suffix}")
-        empty += [] if len(faces) else [space.ids[row]]
-    is_known = all(space.ids[row] in space.frames for row in rows)
+    meshes = tqdm(space.meshes(ids, config.resolution), total=len(ids), unit="shape", disable=None)
+    for id, (vertices, faces) in zip(ids, meshes, strict=True):
+        write_mesh(vertices, faces, folder / "meshes" / f"{id}.{suffix}")
+        empty += [] if len(faces) else [id]
+    is_known = space.frames.keys() >= set(ids)
     frame = "their source's frame" if is_known else "the normalised frame: the run does not know its source's"
-    print(f"meshes:    {folder / 'meshes'}: {len(rows) - len(empty)} in {frame}")
+    print(f"meshes:    {folder / 'meshes'}: {len(ids) - len(empty)} in {frame}")
     if empty:
         print(f"without a surface: {', '.join(empty)}")
 
@@ -71,18 +68,14 @@ def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
     example = (torch.zeros(2, 5, 3), torch.zeros(2, decoder.code_size))
     batch, points = Dim("B", min=1), Dim("N", min=1)
     shapes = {"points": {0: batch, 1: points}, "codes": {0: batch}}
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):
         return torch.export.export(decoder, example, dynamic_shapes=shapes)
 
 
 def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
-    """A function as the content of a file.
-
-    Raises:
-        SdfhubError: what this needs is not installed.
-    """
+    """A function as the content of a file."""
     content = io.BytesIO()
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):
         if kind == "torch_export":
             torch.export.save(function, content)
             return content.getvalue()
@@ -90,30 +83,13 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
             import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-        program = torch.onnx.export(
-            function, input_names=["points", "codes"], output_names=["sdf"], dynamo=True, verbose=False
-        )
+        names: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+        program = torch.onnx.export(function, dynamo=True, verbose=False, **names)
         assert program
-        return _with_named_axes(program.model_proto).SerializeToString()
-
-
-def _with_named_axes(model: Any) -> Any:
-    """An ONNX model whose free axes are called B and N, where PyTorch's exporter numbers them."""
-    graph = model.graph
-    batch, points = (axis.dim_param for axis in graph.input[0].type.tensor_type.shape.dim[:2])
-    for value in (*graph.input, *graph.output, *graph.value_info):
-        for axis in value.type.tensor_type.shape.dim:
-            if axis.dim_param in (batch, points):
-                axis.dim_param = {batch: "B", points: "N"}[axis.dim_param]
-    return model
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without what PyTorch says to its own developers."""
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    finally:
-        logging.disable(logging.NOTSET)
+        model = program.model_proto
+        values = [*model.graph.input, *model.graph.output, *model.graph.value_info]
+        axes = [axis for value in values for axis in value.type.tensor_type.shape.dim]
+        for axis, name in zip([axis.dim_param for axis in axes[:2]], "BN", strict=True):  # of `points`
+            for same in [other for other in axes if other.dim_param == axis]:
+                same.dim_param = name
+        return model.SerializeToString()

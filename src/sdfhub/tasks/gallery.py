@@ -1,32 +1,71 @@
-"""Shapes of a space shown together: a strip of pictures, an animation, meshes one by one and in one scene."""
+"""Tasks `interpolate`, `sample` and `neighbours`: shapes of a space shown together."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from omegaconf import DictConfig
 from torch import Tensor
 from tqdm import tqdm
 
+from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import write_mesh, write_row
 from sdfhub.geometry.picture_file import animation, contact_sheet
 from sdfhub.geometry.render import render
+from sdfhub.opening import beside, load
+from sdfhub.scans.scan import read_scan
 from sdfhub.space import Space, reconstruct
 
 COLUMNS = 8  # pictures side by side where there is no order in them
 
 
+def interpolate(config: DictConfig) -> None:
+    """The shapes on the way from one to another: `config` as conf/interpolate.yaml has it."""
+    space = load(config.run, trust=config.trust or ())
+    codes = space.interpolate(config.a, config.b, config.steps)
+    a, b = (space.ids[space.row(shape)] for shape in (config.a, config.b))
+    captions = [a, *(f"{index / (len(codes) - 1):.2f}" for index in range(1, len(codes) - 1)), b]
+    folder = beside(config.run, config.out, "interpolate/" + f"{a}_to_{b}".replace("/", "-"))
+    write_gallery(space, codes, captions, folder, config.resolution, animated=True)
+
+
+def sample(config: DictConfig) -> None:
+    """New shapes, drawn from a Gaussian fitted to the training codes: `config` as conf/sample.yaml has it."""
+    space = load(config.run, trust=config.trust or ())
+    codes = space.sample(config.n, config.seed)
+    nearest = [space.neighbours(code, 1)[0] for code in codes]
+    for index, (id, distance) in enumerate(nearest):
+        print(f"{index:03d}  nearest training shape: {id} ({distance:.4f})")
+    captions = [f"new\nnearest {id}" for id, _ in nearest]
+    folder = beside(config.run, config.out, f"sample/seed_{config.seed}")
+    write_gallery(space, codes, captions, folder, config.resolution)
+
+
+def neighbours(config: DictConfig) -> None:
+    """The training shapes whose codes are nearest to that of one of them, or of a scan, as conf/ says."""
+    space, shape = load(config.run, trust=config.trust or ()), config.of
+    path = Path(str(shape))
+    if path.is_file():
+        name, scan = path.name, read_scan(path)
+        if scan.kind == "view":
+            raise SdfhubError(f"of={shape}: is a single view; see `sdfhub reconstruct`, which takes such")
+        shape = space.fit_scan(scan)
+    else:
+        name = space.ids[space.row(shape)]
+    nearest = space.neighbours(shape, config.k)
+    for id, distance in nearest:
+        print(f"{id:<40} {distance:.4f}")
+    captions = [f"of {name}", *(f"{id}\n{distance:.3f}" for id, distance in nearest)]
+    codes = space.code([shape, *(id for id, _ in nearest)])
+    folder = beside(config.run, config.out, f"neighbours/{name.replace('/', '-')}")
+    write_gallery(space, codes, captions, folder, config.resolution)
+
+
 def write_gallery(
     space: Space, codes: Tensor, captions: Sequence[str], out: Path, resolution: int, animated: bool = False
 ) -> None:
-    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` and, where asked for, `animation.gif`.
+    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` and, of steps on a way, `animation.gif`.
 
-    All lie in the normalised frame: a code between two shapes, or a new one, has no source.
-
-    Args:
-        space, codes: a space and S of its codes [S, L].
-        captions: S texts below which the pictures stand, of one or two lines.
-        out: folder of the results.
-        resolution: points along an axis of the marching-cubes grid, >= 2.
-        animated: whether the codes are steps of a way, which then stays in one line.
+    All lie in the normalised frame: a code [S, L] between two shapes, or a new one, has no source.
     """
     results = reconstruct(space.decoder, codes, resolution)
     meshes = list(tqdm(results, "meshing", len(codes), leave=False, disable=None))

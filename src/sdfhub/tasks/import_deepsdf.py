@@ -2,8 +2,8 @@
 
 Its decoder is ours in another order: layer 0 reads [code | point], a layer of `latent_in` reads
 [hidden | code | point] and, with `xyz_in_all`, any other [hidden | point], where ours read
-[hidden | encoding | code]; the output always passes through a tanh. Dropout of hidden units and of codes acts
-in training alone, so it does not bear on what an imported run computes.
+[hidden | encoding | code]; the output always passes through a tanh. Weight norm is multiplied out. Dropout of
+hidden units and of codes acts in training alone: it does not bear on what an imported run computes.
 
 Source: github.com/facebookresearch/DeepSDF: networks/deep_sdf_decoder.py, deep_sdf/workspace.py.
 """
@@ -12,49 +12,56 @@ import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from omegaconf import DictConfig
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, write_checkpoint
 from sdfhub.composition import plain
 from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shape_id
-from sdfhub.data.sources.split_file import names_listed
+from sdfhub.data.sources.source import names_listed
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
 from sdfhub.opening import begin_run, load
-from sdfhub.shapes import Frame
+from sdfhub.report.results import first_fault
 
 log = logging.getLogger(__name__)
 
-OWN_KEYS = ("folder", "epoch", "split", "out")
-"""Keys of the task's config that are no part of a training's."""
+OWN_KEYS = ("folder", "epoch", "split", "out")  # of the task's config; no part of a training's
 
 
-class NetworkSpecs(BaseModel):
+class NetworkSpecs(BaseModel, extra="forbid"):
     """`NetworkSpecs` of specs.json: the arguments of DeepSDF's decoder."""
-
-    model_config = ConfigDict(extra="forbid")
 
     dims: list[int] = Field(min_length=1)
     dropout: list[int] | None = None
     dropout_prob: float = 0.0
     norm_layers: list[int] | None = None
-    latent_in: list[int] = Field(default_factory=list)
+    latent_in: list[Annotated[int, Field(ge=1)]] = []
     weight_norm: bool = False
     xyz_in_all: bool | None = None
-    use_tanh: bool = False
+    use_tanh: Literal[False] = False  # another tanh before the last one
     latent_dropout: bool = False
+
+    @model_validator(mode="after")
+    def _as_ours(self) -> "NetworkSpecs":
+        if len(set(self.dims)) > 1:
+            raise ValueError("dims: layers of different widths cannot be represented")
+        if self.norm_layers and not self.weight_norm:
+            raise ValueError("norm_layers: LayerNorm (norm_layers without weight_norm) cannot be represented")
+        if max(self.latent_in, default=0) > len(self.dims):
+            raise ValueError(f"latent_in: must name layers 1 to {len(self.dims)}")
+        return self
 
 
 class Specs(BaseModel):
     """What an import reads of specs.json; other keys say how it was trained and are kept as they are."""
 
-    NetworkArch: str
+    NetworkArch: Literal["deep_sdf_decoder"]
     NetworkSpecs: NetworkSpecs
     CodeLength: int = Field(ge=1)
     TrainSplit: str | None = None
@@ -73,60 +80,43 @@ def import_deepsdf(composed: DictConfig) -> None:
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
     specs = read_specs(folder / "specs.json")
     codes = read_codes(folder / "LatentCodes" / f"{epoch}.pth", specs.CodeLength)
-    file = folder / "ModelParameters" / f"{epoch}.pth"
-    node = decoder_node(specs)
-    weights = decoder_weights(_read(file, "model_state_dict"), specs, node, file)
+    file, node = folder / "ModelParameters" / f"{epoch}.pth", decoder_node(specs)
+    weights = decoder_weights(_read(file, "model_state_dict"), node, file)
     saved_decoder(node, weights, file)  # or says what does not fit
     names = shape_names(folder, specs, split, len(codes))
     source = config["data"]["source"]
     ids = [shape_id(name, by_synset(source["categories"])) for name in names]
-    frames = known_frames(Path(source["root"]), dict(zip(ids, names, strict=True)))
+    samples = Path(source["root"])
+    samples = samples if samples.name == "SdfSamples" else samples / "SdfSamples"
+    frames = {id: frame_of(samples / f"{name}.npz") for id, name in zip(ids, names, strict=True)}
+    known = {id: frame for id, frame in frames.items() if frame}
     for key in OWN_KEYS:
         del config[key]
     config["decoder"] = node
     config["codes"]["max_norm"] = specs.CodeBound
     config["loss"] |= {"delta": specs.ClampingDistance, "lambda_code": specs.CodeRegularizationLambda}
-    begin_run(run, config, ids, [], frames, DeepSdfSource.up)
+    begin_run(run, config, ids, [], known, DeepSdfSource.up)
     shutil.copyfile(folder / "specs.json", run / "specs.json")
     state = {f"decoder.{name}": weight for name, weight in weights.items()} | {"codes.table": codes}
     about = {name: config[name] for name in ("decoder", "codes", "loss", "optim", "computing", "seed")}
     about["shapes"] = len(codes)
     write_checkpoint({"state_dict": state, "hyper_parameters": about}, run / "checkpoints" / LAST)
-    log.info(f"run: {run}: {len(load(run).ids)} shapes, {len(frames)} of them with their source's frame")
+    log.info("run: %s: %d shapes, %d of them with their source's frame", run, len(load(run).ids), len(known))
 
 
 def read_specs(path: Path) -> Specs:
-    """The settings of an experiment.
-
-    Raises:
-        SdfhubError: no experiment, or a decoder that ours cannot be; names the setting.
-    """
+    """The settings of an experiment; refuses, by the setting, a decoder that ours cannot be."""
     try:
-        specs = Specs.model_validate_json(path.read_bytes())
+        return Specs.model_validate_json(path.read_bytes())
     except OSError as error:
         raise SdfhubError(f"{path}: not an experiment of DeepSDF's ({error.strerror})") from error
     except ValidationError as error:
-        wrong = error.errors()[0]
-        raise SdfhubError(f"{path}: {'.'.join(map(str, wrong['loc']))}: {wrong['msg'].lower()}") from error
-    network, layers = specs.NetworkSpecs, {*range(len(specs.NetworkSpecs.dims) + 1)}
-    is_layer_norm = not network.weight_norm and not layers.isdisjoint(network.norm_layers or [])
-    refusals = {
-        "NetworkArch: only deep_sdf_decoder is known": specs.NetworkArch != "deep_sdf_decoder",
-        "dims: layers of different widths cannot be represented": len(set(network.dims)) > 1,
-        "use_tanh: a tanh before the last tanh cannot be represented": network.use_tanh,
-        "norm_layers: LayerNorm (norm_layers without weight_norm) cannot be represented": is_layer_norm,
-        f"latent_in: must name layers 1 to {len(network.dims)}": not {*network.latent_in} <= layers - {0},
-    }
-    for refusal, is_due in refusals.items():
-        if is_due:
-            raise SdfhubError(f"{path}: {refusal}")
-    return specs
+        raise SdfhubError(f"{path}: {first_fault(error)}") from error
 
 
 def decoder_node(specs: Specs) -> dict[str, Any]:
     """DeepSDF's decoder as a node of our config."""
     network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
-    hidden = set(range(depth))
     return {
         "_target_": "sdfhub.model.decoder.Decoder",
         "encoding": {"_target_": "sdfhub.model.encodings.Identity"},
@@ -137,48 +127,38 @@ def decoder_node(specs: Specs) -> dict[str, Any]:
         "inject_encoding": list(range(1, depth + 1)) if network.xyz_in_all else network.latent_in,
         "inject_code": network.latent_in,
         "shorten": True,
-        "weight_norm": network.weight_norm and hidden <= set(network.norm_layers or []),
-        "dropout": network.dropout_prob if hidden <= set(network.dropout or []) else 0.0,
+        "weight_norm": False,
+        "dropout": network.dropout_prob if {*range(depth)} <= {*(network.dropout or [])} else 0.0,
         "tanh": True,
     }
 
 
 def decoder_weights(
-    parameters: Mapping[str, Tensor], specs: Specs, node: Mapping[str, Any], path: Path
+    parameters: Mapping[str, Tensor], node: Mapping[str, Any], path: Path
 ) -> dict[str, Tensor]:
-    """DeepSDF's parameters, from `path`, under the names and in the column order of our decoder, `node`.
-
-    A layer's weight norm is kept where all hidden layers have one, else multiplied out.
-    """
+    """DeepSDF's parameters, from `path`, under the names and in the column order of our decoder, `node`."""
     left = {name.removeprefix("module."): tensor.clone() for name, tensor in parameters.items()}
     weights = {}
     try:
         for index in range(node["depth"] + 1):
-            theirs, ours = f"lin{index}", f"layers.{index}.linear"
-            weights[f"{ours}.bias"] = left.pop(f"{theirs}.bias")
-            length = left.pop(f"{theirs}.weight_g", None)
-            weight = left.pop(f"{theirs}.weight" if length is None else f"{theirs}.weight_v")
-            if index == 0 or index in node["inject_code"]:
-                weight = _reordered(weight, specs.CodeLength)
-            if length is not None and node["weight_norm"] and index < node["depth"]:
-                weights[f"{ours}.parametrizations.weight.original0"] = length
-                weights[f"{ours}.parametrizations.weight.original1"] = weight
-                continue
-            if length is not None:
-                precise = weight.double()
-                weight = (precise * (length / precise.norm(dim=1, keepdim=True))).float()
-            weights[f"{ours}.weight"] = weight
+            weights[f"layers.{index}.linear.bias"] = left.pop(f"lin{index}.bias")
+            length = left.pop(f"lin{index}.weight_g", None)
+            if length is None:
+                weight = left.pop(f"lin{index}.weight")
+            else:
+                direction = left.pop(f"lin{index}.weight_v").double()
+                weight = (direction * (length / direction.norm(dim=1, keepdim=True))).float()
+            if (
+                index == 0 or index in node["inject_code"]
+            ):  # [hidden | code | point] to [hidden | point | code]
+                hidden = weight.shape[1] - 3 - node["code_size"]
+                weight = torch.cat([weight[:, :hidden], weight[:, -3:], weight[:, hidden:-3]], dim=1)
+            weights[f"layers.{index}.linear.weight"] = weight
     except KeyError as error:
         raise SdfhubError(f"{path}: lacks {error}, which specs.json describes") from error
     if left:
         raise SdfhubError(f"{path}: has {min(left)}, which specs.json does not describe")
     return weights
-
-
-def _reordered(weight: Tensor, code_size: int) -> Tensor:
-    """Columns [hidden | code | point] as [hidden | point | code]."""
-    code = weight.shape[1] - 3 - code_size
-    return torch.cat([weight[:, :code], weight[:, -3:], weight[:, code:-3]], dim=1)
 
 
 def read_codes(path: Path, size: int) -> Tensor:
@@ -202,17 +182,10 @@ def _read(path: Path, key: str) -> Any:
 
 
 def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> list[str]:
-    """Names of the shapes in the order of their codes: paths below its data's folder, or numbers.
-
-    `TrainSplit` is relative to the experiment's folder, to one above it, or to the present one; `split`,
-    where given, stands in for it.
-
-    Raises:
-        SdfhubError: the file lists another number of shapes.
-    """
-    above = [Path(), *(parent for parent in (folder.resolve(), *folder.resolve().parents))]
-    places = [Path(split)] if split else [at / specs.TrainSplit for at in above if specs.TrainSplit]
-    file = next((place for place in places if place.is_file()), Path(split) if split else None)
+    """Names of the shapes in the order of their codes, from `split` or the experiment's file, or numbers."""
+    above = [Path(), folder.resolve(), *folder.resolve().parents]  # what TrainSplit may be relative to
+    places = [at / specs.TrainSplit for at in above if specs.TrainSplit]
+    file = Path(split) if split else next((place for place in places if place.is_file()), None)
     if file is None:
         log.warning(
             "%s: TrainSplit %s is not here: shapes are numbered; or give split=", folder, specs.TrainSplit
@@ -223,10 +196,3 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
         what = f"lists {len(names)} shapes, but there are codes of {count}"
         raise SdfhubError(f"{file}: {what}; give the file it was trained with by split=")
     return names
-
-
-def known_frames(root: Path, name_of: Mapping[str, str]) -> dict[str, Frame]:
-    """Frames of shapes, as far as DeepSDF's data lies at `root`."""
-    samples = root if root.name == "SdfSamples" else root / "SdfSamples"
-    frames = {id: frame_of(samples / f"{name}.npz") for id, name in name_of.items()}
-    return {id: frame for id, frame in frames.items() if frame}

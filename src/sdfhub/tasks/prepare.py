@@ -12,11 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def prepare(config: DictConfig) -> None:
-    """Prepares the shapes that a config's `data` group asks for, or the part of them that `part` names.
-
-    Args:
-        config: `part` is None or `i/n`, the i-th of n parts, 1 <= i <= n.
-    """
+    """Prepares the shapes that `data` asks for, or the i-th of n parts of them, which `part=i/n` names."""
     data = instantiate(config.data, "data")
     if config.part is None:
         data.prepared(data.split)

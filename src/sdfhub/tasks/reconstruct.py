@@ -17,7 +17,7 @@ from sdfhub.data.splits import Split, split
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
-from sdfhub.opening import beside, data_of, load, read_run
+from sdfhub.opening import beside, load
 from sdfhub.reconstruction.calibration import Calibration
 from sdfhub.reconstruction.reconstructor import Limits, Reconstructor, Result, is_result, table
 from sdfhub.scans.observed_scan import ObservedScan, ScanFrame
@@ -25,17 +25,14 @@ from sdfhub.scans.scan import FORMATS
 from sdfhub.scans.simulated import ScanKind
 from sdfhub.shapes import NORMALIZED
 from sdfhub.space import Space
+from sdfhub.tasks.evaluate import data_again
 from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
 
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
-    """The files to read, those of a folder included, by the names of their results.
-
-    Raises:
-        SdfhubError: a folder holds no scans, or nothing is named.
-    """
+    """The files to read, those of a folder included, by the names of their results."""
     named: dict[Path, str] = {}
     for path in map(Path, [wanted] if isinstance(wanted, str) else wanted):
         inside = [path]
@@ -50,9 +47,8 @@ def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     if not named:
         raise SdfhubError("scans: names no scan")
     count = Counter(named.values())
-    return unique_ids(
-        {path: stem if count[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
-    )
+    names = {path: stem if count[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
+    return unique_ids(names)
 
 
 def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]:
@@ -71,20 +67,12 @@ def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]
 
 
 def scan_frame(space: Space, frame: Any, of: str | int | None) -> ScanFrame:
-    """Where scans lie.
-
-    Args:
-        space: knows where its shapes lie in their sources' frames.
-        frame: shape, normalised, unknown, or source: that of the source of shape `of`.
-        of: id or row; None where all shapes of the space lie alike.
-    """
+    """Where scans lie; `source` is the frame of the source of shape `of`, None where all shapes lie alike."""
     check(frame, Literal["shape", "normalised", "source", "unknown"], "frame")
-    if of is not None and frame != "source":
-        raise SdfhubError(f"of={of}: needs frame=source")
-    if frame == "normalised":
-        return NORMALIZED
-    if frame in ("shape", "unknown"):
-        return frame
+    if frame != "source":
+        if of is not None:
+            raise SdfhubError(f"of={of}: needs frame=source")
+        return NORMALIZED if frame == "normalised" else frame
     if of is not None:
         id = space.ids[space.row(of)]
         if id not in space.frames:
@@ -97,16 +85,8 @@ def scan_frame(space: Space, frame: Any, of: str | int | None) -> ScanFrame:
 
 
 def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape]:
-    """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source.
-
-    Args:
-        run: its folder.
-        config: of the task; its `data.store` and `data.workers` stand in for the run's own.
-        count: how many.
-    """
-    trained, roles = read_run(run)
-    data = data_of(trained, config.trust or ())
-    data.store, data.workers = config.data.store or data.store, config.data.workers or data.workers
+    """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source."""
+    data, roles = data_again(run, config)[1:]
     offered = {shape.id: shape for shape in data.source.shapes()}
     first = [offered[id] for id in roles["held_out"] if id in offered][:count]
     used = {*roles["train"], *roles["held_out"]}
@@ -128,10 +108,9 @@ def limits_of(
         return {}
     settings: dict[str, Any] = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
     settings["poses"] = plain(config.poses) if reconstructor.poses else None
+    unseen = lambda count: unseen_shapes(run, config, count)  # noqa: E731
     try:
-        return calibration.limits(
-            run, settings, kinds, reconstructor, lambda count: unseen_shapes(run, config, count)
-        )
+        return calibration.limits(run, settings, kinds, reconstructor, unseen)
     except (SdfhubError, OSError, LookupError, TypeError) as error:  # an older run may lack anything
         log.warning("no verdicts: %s", error)
         return {}
@@ -145,10 +124,10 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
     together = check(settings["together"], Annotated[int, Field(ge=1)], "together")
     files = scan_files(check(settings["scans"], str | list[str], "scans"))
     for name, path in files.items():
-        result = out / f"{name}.ply"
-        if result.resolve() == path.resolve() or (result.exists() and not is_result(result)):
+        mesh = out / f"{name}.ply"
+        if mesh.resolve() == path.resolve() or (mesh.exists() and not is_result(mesh)):
             raise SdfhubError(
-                f"out={out}: the result of {path} would overwrite {result}; choose another folder"
+                f"out={out}: the result of {path} would overwrite {mesh}; choose another folder"
             )
     reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
@@ -164,12 +143,6 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
     together = 1 if reconstructor.space.device.type == "cpu" else together
     made = reconstructor.reconstruct(scans, limits, out, together)
     results += tqdm(made, total=len(scans), desc="fitting", unit="scan", leave=False, disable=None)
-    report(results, out)
-    return results
-
-
-def report(results: Sequence[Result], out: Path) -> None:
-    """Prints the table; says and writes down why scans failed."""
     failed = [result for result in results if result.verdict == "failed"]
     if len(failed) < len(results):
         print(f"{table(results)}\n\nmeshes and codes: {out}")
@@ -178,6 +151,7 @@ def report(results: Sequence[Result], out: Path) -> None:
         if len(failed) < len(results) and not (out / f"{result.name}.json").exists():
             result.write(out)
         print(f"sdfhub: error: {result.reason}", file=sys.stderr)
+    return results
 
 
 def reconstruct(config: DictConfig) -> None:

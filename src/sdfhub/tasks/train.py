@@ -4,6 +4,7 @@ import logging
 import warnings
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -14,6 +15,7 @@ from hydra.types import RunMode
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
@@ -30,20 +32,17 @@ from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
 from sdfhub.multirun.cells import go_on, run_cell
-from sdfhub.multirun.processes import ending_together, refuse_processes_in_multirun
 from sdfhub.multirun.search import objective
-from sdfhub.opening import begin_run
-from sdfhub.settings import flat
-from sdfhub.tasks.resuming import refuse_other_settings, refuse_other_shapes
+from sdfhub.opening import begin_run, read_run
+from sdfhub.settings import WHERE_NOT_WHAT, flat
 
 log = logging.getLogger(__name__)
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
+# half precision needs a loss scale; pieces of a batch are differentiated without one
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
-"""Half precision needs a loss scale; pieces of a batch are differentiated without one."""
-WHOLE_MODEL = ("auto", "ddp")
-"""Beginnings of the strategies that leave every weight on every device, as meshing and judging need."""
+WHOLE_MODEL = ("auto", "ddp")  # strategies that leave every weight on every device, as meshing needs
 
 NO_CONCERN = (
     ".*does not have many workers.*",
@@ -54,6 +53,13 @@ NO_CONCERN = (
     ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
 )
 """Lightning's warnings that a user can do nothing about."""
+
+OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
+"""Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
+
+
+FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
+"""Settings that change neither the model nor its data: a run may go on with others."""
 
 
 @dataclass(frozen=True)
@@ -68,53 +74,42 @@ class Parts:
 
 
 def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Trains what a composed config describes into a folder.
-
-    Returns:
-        What `metrics.json` holds; empty for `fast_dev_run` and for processes of a distributed run that are
-        not the first.
-    """
+    """Trains what a config describes into a folder; returns what `metrics.json` holds (first process)."""
     parts, written = make_parts(config, folder), plain(config)
-    refuse_processes_in_multirun(parts.trainer)
+    data, trainer = parts.data, parts.trainer
+    refuse_processes_in_multirun(trainer)
     if config.ckpt_path:
         read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
-    parts.data.prepare_data()
-    parts.data.setup("fit")
-    ids = [shape.id for shape in parts.data.train_shapes]
+    data.prepare_data()
+    data.setup("fit")
+    ids, held_out = ([shape.id for shape in role] for role in (data.train_shapes, data.held_out_shapes))
     if config.ckpt_path:
         refuse_other_shapes(Path(config.ckpt_path), ids)
-    model = parts.model(shapes=parts.data.rows)
-    begin_run(
-        folder,
-        written | {"data": with_absolute_paths(written["data"])},
-        train=ids,
-        held_out=[shape.id for shape in parts.data.held_out_shapes],
-        frames={shape.id: shape.frame for shape in parts.data.train_shapes},
-        up=parts.data.train_shapes[0].up,
-    )
+    model = parts.model(shapes=data.rows)
+    frames = {shape.id: shape.frame for shape in data.train_shapes}
+    kept = written | {"data": with_absolute_paths(written["data"])}
+    begin_run(folder, kept, ids, held_out, frames, data.train_shapes[0].up)
     log.info("run: %s", folder)
-    log_settings(parts.trainer, written)
+    for logger in trainer.loggers:
+        if not isinstance(logger, TensorBoardLogger):  # takes settings once, with the scores
+            logger.log_hyperparams(flat(written))
     fit(model, parts, config.ckpt_path)
-    if not parts.trainer.is_global_zero:
+    if not trainer.is_global_zero:
         return {}
-    if getattr(parts.trainer, "fast_dev_run", False):
+    if getattr(trainer, "fast_dev_run", False):
         log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
         return {}
     checkpoint = folder / "checkpoints" / LAST
     if not checkpoint.exists():  # callbacks without one of checkpoints
-        parts.trainer.save_checkpoint(checkpoint)
+        trainer.save_checkpoint(checkpoint)
     metrics = judge(model, parts, folder)
-    log_scores(parts.trainer, written, metrics)
+    log_scores(trainer, written, metrics)
     return metrics
 
 
 def make_parts(config: DictConfig, folder: Path) -> Parts:
-    """The objects of a training.
-
-    Raises:
-        SdfhubError: a setting that is unknown, missing, of the wrong type or out of range.
-    """
+    """The objects of a training; refuses a setting that is unknown, missing, of the wrong type or range."""
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
     torch.manual_seed(check(config.seed, Seed, "seed"))
@@ -126,21 +121,12 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
     trainer = make_trainer(config.trainer, folder, callbacks, loggers)
-    return Parts(
-        data=instantiate(config.data, "data"),
-        model=partial(AutoDecoder, **model, seed=config.seed),
-        trainer=trainer,
-        record=record,
-        evaluation=instantiate(config.evaluate, "evaluate"),
-    )
+    data, evaluation = instantiate(config.data, "data"), instantiate(config.evaluate, "evaluate")
+    return Parts(data, partial(AutoDecoder, **model, seed=config.seed), trainer, record, evaluation)
 
 
 def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
-    """The objects of a group of named parts; a part that is null is left out.
-
-    Raises:
-        SdfhubError: a part is no such object.
-    """
+    """The objects of a group of named parts, all of a Lightning `kind`; a part that is null is left out."""
     parts = []
     for name, node in (config or {}).items():
         if node is not None:
@@ -161,17 +147,12 @@ def make_optimisation(config: DictConfig) -> Optimisation:
 def make_trainer(
     config: DictConfig, folder: Path, callbacks: list[Callback], loggers: list[Logger]
 ) -> Trainer:
-    """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours.
-
-    Raises:
-        SdfhubError: names a setting that would give a wrong result, or that this machine cannot do.
-    """
+    """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours."""
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
-        raise SdfhubError(
-            f"trainer.strategy={config.strategy}: shapes are meshed with all weights on each device; use ddp"
-        )
+        hint = "shapes are meshed with all weights on each device; use ddp"
+        raise SdfhubError(f"trainer.strategy={config.strategy}: {hint}")
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
@@ -180,27 +161,62 @@ def make_trainer(
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).propagate = True
-    # what hardware there is not, advertisements, defaults of Lightning's own files
-    for name in ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors"):
+    for name in OF_NO_CONCERN:
         logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     return instantiate(config, "trainer", **given)
 
 
 def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
-    """Trains, from a checkpoint if one is named.
+    """Trains, from a checkpoint if one is named; ends together with the other processes of the run."""
+    try:
+        parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
+    except torch.OutOfMemoryError as error:
+        raise SdfhubError(
+            "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
+            "data.loader.resident=false leaves the samples on the disk"
+        ) from error
+    except SIGTERMException as stop:
+        raise SystemExit(143) from stop  # Lightning's has status 0
+    except RuntimeError as error:  # gloo raises it bare, NCCL a kind of it
+        is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
+        if parts.trainer.world_size > 1 and is_loss:
+            lost = "another process of this run has died; continue from its last checkpoint"
+            raise SdfhubError(lost) from error
+        raise
 
-    Raises:
-        SdfhubError: the samples or a piece of a batch do not fit the GPU.
-    """
-    with ending_together(parts.trainer):
-        try:
-            parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
-        except torch.OutOfMemoryError as error:
+
+def refuse_processes_in_multirun(trainer: Trainer) -> None:
+    """Refuses a cell whose trainer would start processes: each of them would walk the whole multirun."""
+    cluster = getattr(trainer.strategy, "cluster_environment", None)
+    starts = trainer.world_size > 1 and not (cluster and cluster.creates_processes_externally)
+    if starts and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        hint = "a cell of a multirun has one device, or processes of SLURM; set 1"
+        raise SdfhubError(f"trainer.devices: {hint}")
+
+
+def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
+    """Refuses to continue a checkpoint under settings that its training did not have, and names them."""
+    folder = checkpoint.parent.parent
+    if not (folder / "config.yaml").is_file():
+        return
+    then, now = flat(read_run(folder)[0]), flat(config)
+    keys = sorted(key for key in then | now if not key.startswith(FREE_TO_CHANGE))
+    differing = [f"{k}={then.get(k)} (now {now.get(k)})" for k in keys if then.get(k) != now.get(k)]
+    if differing:
+        raise SdfhubError(f"ckpt_path={checkpoint}: was trained with {', '.join(differing)}; repeat that")
+
+
+def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
+    """Refuses to continue a checkpoint where data= now offers other shapes: a code is known by its row."""
+    folder = checkpoint.parent.parent
+    then = read_run(folder)[1]["train"] if (folder / "split.json").is_file() else ids
+    for row, (before, now) in enumerate(zip_longest(then, ids, fillvalue="none")):
+        if before != now:
             raise SdfhubError(
-                "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
-                "data.loader.resident=false leaves the samples on the disk"
-            ) from error
+                f"ckpt_path={checkpoint}: the shapes that data= offers have changed: code {row} is that of "
+                f"{before}, now it would be that of {now}; bring them back, or train anew"
+            )
 
 
 def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
@@ -212,13 +228,6 @@ def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
     train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
     codes, delta = model.codes.table.detach(), model.loss.delta
     return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
-
-
-def log_settings(trainer: Trainer, config: dict[str, Any]) -> None:
-    """Gives every logger the run's settings, but TensorBoard, which takes them once, with the scores."""
-    for logger in trainer.loggers:
-        if not isinstance(logger, TensorBoardLogger):
-            logger.log_hyperparams(flat(config))
 
 
 def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:

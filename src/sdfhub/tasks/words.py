@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p")
@@ -11,44 +12,31 @@ TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir",
 def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     """A command line's words, in which positional ones have become `name=value`.
 
-    A word is positional if it names an existing file or folder, or has no `=` and is no option or deletion
-    (`-m`, `~key`). Names that the line also gives as `name=value` are left out. Words beyond the names stay
-    as they are, for Hydra to refuse.
-
-    Args:
-        argv: words after the task's name.
-        names: of the positional words, in order; the last may end with `...` and takes any number of them.
+    Names that the line also gives as `name=value` are left out; the last may end with `...` and takes any
+    number of words. Words beyond the names stay as they are, for Hydra to refuse.
 
     >>> words_to_overrides(["my run", "a.ply", "b,c.ply", "frame=unknown"], ["run", "scans..."])
-    ["run='my run'", "scans=['a.ply','b,c.ply']", 'frame=unknown']
+    ["run='my run'", 'frame=unknown', "scans=['a.ply','b,c.ply']"]
     """
     given = {word.partition("=")[0] for word in argv if not is_positional(word)}
     left = [name for name in names if name.removesuffix("...") not in given]
     overrides: list[str] = []
     many: list[str] = []
-    is_value = False
-    for word in argv:
-        if is_value or not is_positional(word) or not left:
+    for before, word in zip(["", *argv], argv, strict=False):
+        if before in TAKES_A_VALUE or not is_positional(word) or not left:
             overrides.append(word)
-        elif not left[0].endswith("..."):
-            overrides.append(f"{left.pop(0)}={quoted(word)}")
-        else:
-            if not many:
-                overrides.append(left[0])  # its place, filled below
+        elif left[0].endswith("..."):
             many.append(quoted(word))
-        is_value = word in TAKES_A_VALUE
-    if many:
-        overrides[overrides.index(left[0])] = f"{left[0].removesuffix('...')}=[{','.join(many)}]"
-    return overrides
+        else:
+            overrides.append(f"{left.pop(0)}={quoted(word)}")
+    return [*overrides, f"{left[0].removesuffix('...')}=[{','.join(many)}]"] if many else overrides
 
 
 def is_positional(word: str) -> bool:
     """Whether a word is a value without its name: an existing path, or neither assignment nor option."""
-    try:
+    with suppress(OSError, ValueError):  # longer than a name may be, or with a NUL
         if word and Path(word).exists():
             return True
-    except (OSError, ValueError):  # longer than a name may be, or with a NUL
-        pass
     return "=" not in word and not word.startswith(("-", "~"))
 
 

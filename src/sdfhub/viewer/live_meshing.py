@@ -26,15 +26,10 @@ class Meshed:
 
 
 class LiveMesher:
-    """A thread that meshes the latest code.
+    """A thread that meshes the latest code on grids of rising `resolutions` and calls `show` with each mesh.
 
     The first resolution is always finished, so that something moves while codes come faster than meshes; a
-    finer one is given up as soon as another code is asked for.
-
-    Args:
-        decoder: in evaluation mode, its weights without gradients.
-        resolutions: points along an axis of the grid, coarse to fine.
-        show: called in that thread with every mesh, or with the reason why there is none.
+    finer one is given up as soon as another code is asked for. `show` also gets the reason of a failure.
     """
 
     def __init__(
@@ -62,10 +57,9 @@ class LiveMesher:
                 self._refine(*request)
             except _Outdated:
                 pass
-            except SdfhubError as error:
-                self.show(error)
             except Exception as error:  # such as no memory left: the page must hear of it, and go on
-                self.show(SdfhubError(f"{type(error).__name__}: {error}"))
+                reason = f"{type(error).__name__}: {error}"
+                self.show(error if isinstance(error, SdfhubError) else SdfhubError(reason))
 
     def _refine(self, code: Tensor, about: Any, asked: float) -> None:
         for index, resolution in enumerate(self.resolutions):

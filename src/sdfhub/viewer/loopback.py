@@ -6,9 +6,7 @@ Here a page comes from this server on a loopback address or is refused, there is
 messages only those pass that the page needs.
 """
 
-import contextlib
 import http
-import io
 import logging
 import math
 import socket
@@ -41,11 +39,7 @@ _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, a
 
 
 class LoopbackServer(viser.ViserServer):
-    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one.
-
-    Raises:
-        SdfhubError: the port is taken.
-    """
+    """viser behind a gate; files of `suffixes`, in lower case, may be uploaded; port 0 takes a free one."""
 
     def __init__(self, port: int, label: str, suffixes: Collection[str]):
         try:  # viser would go on to the next port, whoever may wait at this one
@@ -55,15 +49,9 @@ class LoopbackServer(viser.ViserServer):
         plain = sockets.serve
         sockets.serve = partial(_Serve, suffixes)  # type: ignore[misc, assignment]  # viser has no option for it
         try:
-            with contextlib.redirect_stdout(io.StringIO()):
-                super().__init__(host=HOST, port=port, label=label, verbose=False)
+            super().__init__(host=HOST, port=port, label=label, verbose=False)
         finally:
             sockets.serve = plain  # type: ignore[misc]
-
-    def stop(self) -> None:
-        """Ends it, without viser's announcement."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            super().stop()
 
 
 def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
@@ -83,19 +71,16 @@ def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
 
 
 def passed(raw: bytes, suffixes: Collection[str]) -> bytes | None:
-    """A page's message as viser shall see it; None where it shall not.
-
-    Values of controls, the camera and parts of files pass; a file too large or of another type arrives empty.
-    """
+    """A page's message as viser shall see it, or None; a file too large or of another type arrives empty."""
     try:
         message: dict[str, Any] = msgspec.msgpack.decode(raw)
         kind = message["type"]
         if kind == "FileTransferStartUpload":
             size, parts = message["size_bytes"], message["part_count"]
             is_known = str(message["filename"]).lower().endswith(tuple(suffixes))
-            if not is_known or not 0 < size <= MAX_UPLOAD or parts != math.ceil(size / PART):
-                return msgspec.msgpack.encode(message | {"size_bytes": 0, "part_count": 0})
-            return raw
+            if is_known and 0 < size <= MAX_UPLOAD and parts == math.ceil(size / PART):
+                return raw
+            return msgspec.msgpack.encode(message | {"size_bytes": 0, "part_count": 0})
         is_part = kind == "FileTransferPart" and len(message["content"]) <= PART
         is_value = kind == "GuiUpdateMessage" and message["updates"].keys() == {"value"}
         return raw if is_part or is_value or kind == "ViewerCameraMessage" else None
@@ -115,18 +100,13 @@ class _Serve(sockets.serve):
                 response.headers["Content-Security-Policy"] = policy
             return response
 
-        options |= {"create_connection": partial(_Gated, suffixes), "max_size": 2 * PART, "logger": _QUIET}
+        class Gated(sockets.ServerConnection):
+            """A page's connection, of which viser sees only what passes."""
+
+            async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
+                while True:
+                    if (message := passed(await super().recv(decode=False), suffixes)) is not None:
+                        return message
+
+        options |= {"create_connection": Gated, "max_size": 2 * PART, "logger": _QUIET}
         super().__init__(*arguments, process_request=answer, **options)
-
-
-class _Gated(sockets.ServerConnection):
-    """A page's connection, of which viser sees only what passes."""
-
-    def __init__(self, suffixes: Collection[str], *arguments: Any, **options: Any):
-        super().__init__(*arguments, **options)
-        self._suffixes = suffixes
-
-    async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
-        while True:
-            if (message := passed(await super().recv(decode=False), self._suffixes)) is not None:
-                return message

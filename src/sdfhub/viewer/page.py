@@ -1,7 +1,4 @@
-"""A page of shapes to see, turn, mix and fit to a scan.
-
-A code is shown: between the shapes A and B, moved along the principal directions of the codes.
-"""
+"""A page of a code's shape: between shapes A and B, moved along principal directions, or fitted to a scan."""
 
 import html
 import threading
@@ -11,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.geometry.up_axis import turned_up
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
@@ -42,19 +39,16 @@ STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
 
 class Viewer:
-    """The page of a space, called `title`; its grid has `resolution` points along an axis when nothing moves.
-
-    Attributes:
-        shapes: codes [L] by the names under which the page offers them.
-        drawn: set as soon as there is something to see.
-    """
+    """The page of a space, its grid of `resolution` points along an axis when nothing moves."""
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
         self.space = space
         self.scans: dict[str, np.ndarray] = {}
+        # codes [L] by the names under which the page offers them
         self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
         self.axes = space.principal_directions[:DIRECTIONS]
-        self.drawn, self._reading, self._fitting = threading.Event(), threading.Lock(), threading.Lock()
+        self.drawn = threading.Event()  # set as soon as there is something to see
+        self._reading, self._fitting = threading.Lock(), threading.Lock()
         self.server = LoopbackServer(port, "sdfhub", FORMATS)
         self._add_scene()
         self._add_controls(title)
@@ -82,7 +76,11 @@ class Viewer:
         """Back to the shape A itself."""
         for slider in (self.share, *self.sliders):
             slider.value = 0.0
-        self._show_scan()
+        points = self.scans.get(self.a.value)
+        with self.server.atomic():
+            self.scan.visible = points is not None
+            if points is not None:
+                self.scan.points = points
         self.refresh()
 
     def fit(self, name: str, content: bytes) -> None:
@@ -110,12 +108,10 @@ class Viewer:
         """How well a code fits the points of a scan's surface, and whether it is one of this space."""
         with torch.no_grad():
             distance = float(self.space.sdf(surface, code).abs().mean())
-        text = f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2."
-        if distance > FAR:
-            return f"{text} Doubtful: that is far."
-        if self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max():
-            return f"{text} Doubtful: its code is unlike those of this space's shapes."
-        return text
+        is_strange = self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max()
+        strange = " Doubtful: its code is unlike those of this space's shapes." if is_strange else ""
+        doubt = " Doubtful: that is far." if distance > FAR else strange
+        return f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2.{doubt}"
 
     def _draw(self, meshed: Meshed | SdfhubError) -> None:
         if isinstance(meshed, SdfhubError):
@@ -130,14 +126,6 @@ class Viewer:
                 text = paragraph(size if len(faces) else "no surface", "small")
                 self.name.content = paragraph(meshed.about, "name") + text
         self.drawn.set()
-
-    def _show_scan(self) -> None:
-        points = self.scans.get(self.a.value)
-        with self.server.atomic():
-            self.scan.visible = points is not None and self.overlay.value
-            self.overlay.visible = points is not None
-            if points is not None:
-                self.scan.points = points
 
     def _show_message(self, text: str, kind: str = "small") -> None:
         self.message.content = paragraph(text, kind)
@@ -162,10 +150,9 @@ class Viewer:
         gui.add_html(f"<style>{STYLE}</style>" + paragraph(title, "title") + paragraph(size, "small"))
         self.name = gui.add_html(paragraph("…", "name"))
         with gui.add_folder("Shape"):
-            self.a: Any = gui.add_dropdown("A", names, hint="What is shown; type to search")
+            self.a: Any = gui.add_dropdown("A", names)
             self.b: Any = gui.add_dropdown("B", names, initial_value=names[1])
-            hint = "On the line between their codes"
-            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0, hint=hint)
+            self.share: Any = gui.add_slider("A to B", 0.0, 1.0, 0.01, 0.0)
         with gui.add_folder("Principal directions"):
             hint = "Standard deviations of the codes along this axis; 0 is the shape above"
             axes = range(1, len(self.axes) + 1)
@@ -175,23 +162,15 @@ class Viewer:
             upload = gui.add_upload_button("Drop a scan here, or click", mime_type=",".join(FORMATS))
             kinds = f"A mesh or a cloud of a whole shape: {' '.join(FORMATS)}; at most {MAX_UPLOAD >> 20} MiB"
             self.message = gui.add_html(paragraph(kinds, "small"))
-            self.overlay = gui.add_checkbox("Show the scan's points", True, visible=False)
         self.a.on_update(lambda _: self.reset())
         for control in (self.b, self.share, *self.sliders):
             control.on_update(lambda _: self.refresh())
         reset.on_click(lambda _: self.reset())
-        self.overlay.on_update(lambda _: self._show_scan())
         upload.on_upload(lambda _: self.fit(upload.value.name, upload.value.content))
 
 
 def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
-    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame.
-
-    The file's name is for messages and its suffix; nothing is opened under it.
-
-    Raises:
-        SdfhubError: names the file and what is wrong with it.
-    """
+    """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame."""
     suffix = PurePath(name).suffix.lower()
     if suffix not in FORMATS:
         raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
@@ -210,11 +189,10 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
 
 
 def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
-    """At most POINTS points [M, 3] of a scan's surface, in its frame: all over a mesh, or of a cloud."""
+    """At most POINTS points [M, 3] of a scan's surface, in its frame."""
     if scan.faces is None:
         return scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    mesh = trimesh.Trimesh(scan.points, scan.faces, process=False)
-    return np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=rng)[0])
+    return sample_surface(scan.points, scan.faces, POINTS, rng)[0]
 
 
 def bounded(value: float, low: float, high: float) -> float:
