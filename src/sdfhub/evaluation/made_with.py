@@ -1,4 +1,4 @@
-"""What a training ran with: versions and hardware, kept beside its scores so that both can be told."""
+"""What a training ran with, kept beside its scores."""
 
 import platform
 import re
@@ -8,15 +8,13 @@ from pathlib import Path
 import torch
 from lightning.pytorch import Trainer
 
-PACKAGES = ("sdfhub", "torch", "lightning", "numpy")
-
 
 def made_with(trainer: Trainer) -> dict[str, str]:
-    """Versions, the device that trained, its threads or processes, and the precision; plain text by name."""
+    """Versions and hardware as plain text by name."""
     device = trainer.strategy.root_device
     return {
         "python": platform.python_version(),
-        **{name: version(name) for name in PACKAGES},
+        **{name: version(name) for name in ("sdfhub", "torch", "lightning", "numpy")},
         "system": f"{platform.system()} {platform.machine()}",
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
         "threads": str(torch.get_num_threads()),

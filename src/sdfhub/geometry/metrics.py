@@ -6,7 +6,7 @@ distances in their squares; nothing is multiplied by 10^3 here. Two samplings of
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import igl
@@ -129,16 +129,29 @@ def _edges_cancel(faces: np.ndarray) -> bool:
     return np.array_equal(rising, falling)
 
 
-def summarize(rows: Sequence[ShapeMetrics]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class DistanceMetrics:
+    """The judgement of a field where the source has no mesh."""
+
+    sdf_error: float  # mean |f - d| over samples with |d| < delta, normalised units
+    sign_accuracy: float  # share of samples on the right side
+
+
+def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, Any]:
     """Statistics of every metric over a set of shapes, and the `count` of shapes that have it."""
-    with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
-    summary = {"shapes": len(rows), "failed": sum(row.failed for row in rows), "failures": FAILURES}
-    for name in ("mean", "median"):
-        summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
-    for name in (field.name for field in fields(ShapeMetrics) if field.name not in ("failed", "cd_penalty")):
-        values = [getattr(row, name) for row in rows if not row.failed and getattr(row, name) is not None]
-        statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
-        summary[name] = statistics | {"count": len(values)}
+    summary: dict[str, Any] = {"shapes": len(metrics)}
+    rows = [row for row in metrics if isinstance(row, ShapeMetrics)]
+    if len(rows) == len(metrics):
+        summary |= {"failed": sum(row.failed for row in rows), "failures": FAILURES}
+        with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
+        for name in ("mean", "median"):
+            summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
+    plain = [asdict(row) for row in metrics if not getattr(row, "failed", False)]
+    for name in (field.name for field in fields(metrics[0] if metrics else ShapeMetrics)):
+        if name not in ("failed", "cd_penalty"):
+            values = [row[name] for row in plain if row[name] is not None]
+            statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
+            summary[name] = statistics | {"count": len(values)}
     return summary
 
 

@@ -59,10 +59,6 @@ class Gaussian:
         return self.mean + along @ self.axes + self.rest * besides
 
     def unusual(self, codes: Tensor) -> Tensor:
-        """[B] squared distances of codes [B, L] to the mean, 1 on average for codes drawn from it.
-
-        The covariance does not weigh directions: a scan that says little leaves a code where the prior wants
-        it, and no direction of what is left tells strangers better than its length.
-        """
+        """[B] squared distances of codes [B, L] to the mean, 1 on average for codes drawn from it."""
         variance = self.axes.square().sum() + self.rest**2 * len(self.mean)
         return (codes - self.mean).square().sum(1) / variance.clamp(min=1e-6 * len(self.mean))

@@ -1,7 +1,4 @@
-"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, fit better.
-
-A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
-"""
+"""When a fit is doubtful: where unseen shapes of a run's data, scanned alike, fit better; kept in the run."""
 
 import hashlib
 import json
@@ -26,8 +23,7 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
-# what is judged: limits of another rule are not taken for these
-RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
+RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"  # limits of others count no more
 
 
 @dataclass(frozen=True)
@@ -58,10 +54,7 @@ class Calibration:
     ) -> dict[ScanKind, Limits]:
         """The limits of kinds of scans: the run's own, or measured now and kept in its folder.
 
-        Args:
-            run, settings: its folder; plain data of all that fits depend on.
-            kinds, reconstructor: which are wanted; fits scans.
-            unseen_shapes: up to so many shapes of the run's data that it was not trained on.
+        `settings` are all that fits depend on, `unseen_shapes` gives up to so many shapes of the run's data.
         """
         key = digest(run, settings)
         known = _read(run / FILE).get(key, {})
@@ -80,9 +73,7 @@ class Calibration:
                 log.warning("%s: is not kept: %s", run / FILE, error.strerror)
         return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
 
-    def _measured(
-        self, kind: ScanKind, shapes: Sequence[StoredShape], reconstructor: Reconstructor
-    ) -> dict[str, Any]:
+    def _measured(self, kind: ScanKind, shapes: list[StoredShape], reconstructor: Reconstructor) -> dict:
         """Limits for a kind of scan, and the residuals and doubts of unseen shapes that they come from."""
         scans = kind.observations(shapes, reconstructor.evidence)
         residuals, doubts = [], []

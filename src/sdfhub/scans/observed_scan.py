@@ -36,8 +36,7 @@ class ObservedScan:
 def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
     """What a scan says of the shape behind it.
 
-    A mesh becomes signed samples. Signed samples lie in the normalised frame as they are, unless another
-    known frame is given. A view shows no whole bounding box, so that its frame must be known or unknown.
+    A mesh becomes signed samples; these lie in the normalised frame unless another known one is given.
     """
     if scan.faces is not None:
         return _observe_mesh(scan, scan.faces, evidence, frame, rng)
@@ -67,9 +66,7 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
     return ObservedScan(scan.kind, len(points), observation, lies)
 
 
-def _observe_mesh(
-    scan: Scan, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
-) -> ObservedScan:
+def _observe_mesh(scan: Scan, faces, evidence: Evidence, frame: ScanFrame, rng) -> ObservedScan:
     if isinstance(frame, Frame):
         _refuse_misplaced(frame.to_normalized(scan.points), LARGEST)
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
@@ -82,13 +79,8 @@ def _observe_mesh(
     return replace(observe(samples, evidence, frame, rng), count=len(scan.points))
 
 
-def observations_of(
-    shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]
-) -> list[Observation]:
-    """Signed samples of prepared shapes as observations: so many of each, half of them inside; None for all.
-
-    A shape has a seed of its own, so that its samples do not depend on its neighbours.
-    """
+def observations_of(shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]) -> list:
+    """Observations of so many signed samples of each shape by a seed of its own; None for all samples."""
     observations = []
     for shape, seed in zip(shapes, seeds, strict=True):
         if samples is None:

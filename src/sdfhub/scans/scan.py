@@ -59,12 +59,11 @@ class Scan:
 
 
 def read_scan(path: str | Path) -> Scan:
-    """The scan in a file; whatever is wrong with one is a line that names it.
+    """The scan in a file.
 
     Meshes as in `read_mesh`; a .ply without faces is a cloud, with normals if its vertices have nx, ny, nz.
     .xyz (text) and .npy: rows x y z or x y z nx ny nz. .npz: `pos` and `neg` are DeepSDF's samples; `points`
-    and `sdf` (and `center`, `scale`) are signed samples; `points`, and `normals` and `sensor` if there, are
-    a cloud.
+    and `sdf` (and `center`, `scale`) are signed samples; `points` (`normals`, `sensor`) are a cloud.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -74,15 +73,14 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: no such file")
     if path.stat().st_size > MAX_BYTES:
         raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
-    readers: dict[str, Callable[[Path], np.ndarray]]
-    readers = {".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}
+    readers: dict[str, Callable] = {".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}
     try:
         if suffix == ".npz":
             return _archive(path)
         if suffix in readers and not (suffix == ".ply" and _has_faces(path)):
             return _cloud(readers[suffix](path))
-        vertices, faces = read_mesh(path)
-        return Scan(vertices, faces=faces)
+        mesh = read_mesh(path)
+        return Scan(mesh[0], faces=mesh[1])
     except RejectedMesh as rejection:
         raise SdfhubError(rejection.detail) from rejection
     except SdfhubError:
