@@ -10,7 +10,6 @@ from sdfhub.latent.similarity import PoseRange, Similarity
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Observation
 
-
 Shapes = Sequence[Observation]
 
 

@@ -149,7 +149,7 @@ class GaussNewtonFit:
 
 
 def in_groups(fit: Callable[[Shapes], list[Tensor]], observations: Shapes, device: Any) -> list[Tensor]:
-    """What a fit finds: on a CPU one by one, so that no neighbour changes a rounding, else of a size at once."""
+    """What a fit finds: on a CPU one by one, so that no neighbour changes a rounding, else by size."""
     groups: dict[int, list[int]] = {}
     for row, observation in enumerate(observations):
         groups.setdefault(row if device.type == "cpu" else len(observation.points), []).append(row)

@@ -58,7 +58,7 @@ class Rows(NamedTuple):
 
 
 def violation(decoder: Decoder, codes: Tensor, rows: Rows, delta: float) -> Tensor:
-    """How far outside its bounds the clamped field of codes [B, L] is, signed: [B, N]; rows of B shapes or one."""
+    """How far outside its bounds the clamped field of codes [B, L] is, [B, N]; rows of B shapes or one."""
     field = decoder(rows.points.expand(len(codes), -1, -1), codes).clamp(-delta, delta)
     field = torch.where(rows.unsigned, field.abs(), field)
     return (field - rows.high.clamp(-delta, delta)).relu() - (rows.low.clamp(-delta, delta) - field).relu()
@@ -93,7 +93,7 @@ class Problem:
     def about(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The objective at unknowns [B, U], its gradient [B, U] and a positive definite Hessian [B, U, U].
 
-        Large violations enter as reweighted squares: |v| ~ v^2 / |v|, with 1 / max(|v|, soft) held for a step.
+        Large violations enter as reweighted squares: |v| ~ v^2 / |v|, 1 / max(|v|, soft) held for a step.
 
         Source: Holland and Welsch 1977 (reweighting).
         """

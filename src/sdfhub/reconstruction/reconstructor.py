@@ -94,7 +94,7 @@ class Reconstructor:
         return self.fit(self.space.decoder, self.space.codes, observations, self.space.delta, self.poses)
 
     def doubts(self, fitted: Fitted) -> Tensor:
-        """[B] residuals * (1 + unusual)^4: the residual of a stranger may be small, but its code is far off."""
+        """[B] residuals * (1 + unusual)^4: the residual of a stranger may be small, its code is far off."""
         return fitted.residuals * (1 + self.space.unusual(fitted.codes)) ** 4
 
     def meshes(self, scans: Sequence[ObservedScan], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
