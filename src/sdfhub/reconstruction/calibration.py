@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeInt, PositiveFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 from tqdm import tqdm
 
@@ -57,18 +57,17 @@ class Calibration:
         `settings` are all that fits depend on, `unseen_shapes` gives up to so many shapes of the run's data.
         """
         key = digest(run, settings)
-        known = _read(run / FILE).get(key, {})
+        kept = _read(run / FILE)
+        known = kept.setdefault(key, {})
         missing = [kind for kind in kinds if "limits" not in known.get(str(kind), {})]
         shapes = unseen_shapes(self.shapes) if missing else []
         if missing and len(shapes) < 3:
             raise SdfhubError(f"the run's data has {len(shapes)} unseen shapes, a calibration needs 3")
         for kind in missing:
             log.info("calibration: %s: fits %d unseen shapes, once", kind, len(shapes))
-            entry = self._measured(kind, shapes, reconstructor)
-            kept = _read(run / FILE)  # again: another process may have added to it meanwhile
-            known = kept.get(key, {}) | known | {str(kind): entry}
+            known[str(kind)] = self._measured(kind, shapes, reconstructor)
             try:
-                write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+                write_whole(run / FILE, json.dumps(kept, indent=1))
             except OSError as error:  # another user's run: the limits serve this command at least
                 log.warning("%s: is not kept: %s", run / FILE, error.strerror)
         return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
@@ -96,7 +95,6 @@ def digest(run: Path, settings: dict[str, Any]) -> str:
 def _read(path: Path) -> dict[str, Any]:
     """What is kept; nothing where the file is missing or broken, which costs a calibration."""
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        return {key: {kind: dict(entry) for kind, entry in kinds.items()} for key, kinds in kept.items()}
-    except (OSError, ValueError, AttributeError, TypeError):
+        return TypeAdapter(dict[str, dict[str, dict[str, Any]]]).validate_json(path.read_bytes())
+    except (OSError, ValueError):
         return {}
