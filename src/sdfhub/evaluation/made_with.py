@@ -11,19 +11,15 @@ from lightning.pytorch import Trainer
 
 def made_with(trainer: Trainer) -> dict[str, str]:
     """Versions and hardware as plain text by name."""
-    device = trainer.strategy.root_device
+    device, cpuinfo = trainer.strategy.root_device, Path("/proc/cpuinfo")
+    name = re.search(r"model name\s*: (.*)", cpuinfo.read_text("utf-8")) if cpuinfo.exists() else None
+    processor = name[1] if name else platform.processor() or "unknown"
     return {
         "python": platform.python_version(),
         **{name: version(name) for name in ("sdfhub", "torch", "lightning", "numpy")},
         "system": f"{platform.system()} {platform.machine()}",
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _processor(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else processor,
         "threads": str(torch.get_num_threads()),
         "processes": str(trainer.world_size),
         "precision": str(trainer.precision),
     }
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    name = re.search(r"model name\s*: (.*)", cpuinfo.read_text("utf-8")) if cpuinfo.exists() else None
-    return name[1] if name else platform.processor() or "unknown"

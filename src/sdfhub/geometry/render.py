@@ -61,10 +61,8 @@ def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
 
 def _changes(labels: np.ndarray) -> np.ndarray:
     """Pixels whose right or lower neighbour has another label."""
-    edge = np.zeros(labels.shape, dtype=bool)
-    edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
-    edge[:-1] |= labels[:-1] != labels[1:]
-    return edge
+    down, right = np.diff(labels, axis=0, append=labels[-1:]), np.diff(labels, append=labels[:, -1:])
+    return (down != 0) | (right != 0)
 
 
 def seen_from(

@@ -5,6 +5,7 @@ import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,9 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: no such file")
     if path.stat().st_size > MAX_BYTES:
         raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
-    readers: dict[str, Callable] = {".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}
+    # mapped, a header that claims more than the file fails
+    load_array = partial(np.load, mmap_mode="r", allow_pickle=False)
+    readers: dict[str, Callable] = {".xyz": np.loadtxt, ".npy": load_array, ".ply": _ply_rows}
     try:
         if suffix == ".npz":
             return _archive(path)
@@ -95,10 +98,6 @@ def _cloud(rows: np.ndarray) -> Scan:
         raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
     rows = rows.astype(np.float64)
     return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
-
-
-def _array_rows(path: Path) -> np.ndarray:
-    return np.load(path, mmap_mode="r", allow_pickle=False)  # a header that claims more than the file fails
 
 
 def _has_faces(path: Path) -> bool:
