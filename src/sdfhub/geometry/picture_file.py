@@ -34,8 +34,6 @@ def contact_sheet(
             draw, pad = ImageDraw.Draw(tile), size // 16
             caption = "".join(captions[i * columns + j :][:1])
             draw.text((4, band / 2), caption, fill=_INK, font=font, anchor="lm")
-                (4, band / 2), "".join(captions[i * columns + j :][:1]), fill=_INK, font=font, anchor="lm"
-            )
             if isinstance(content, str):
                 draw.rectangle((pad, band + pad, size - pad, band + size - pad), fill=_TILE, outline=_FAINT)
                 draw.text((size / 2, band + size / 2), content, fill=_FAINT, font=large, anchor="mm")
