@@ -1,14 +1,7 @@
 """A trained shape space from disk: a run's folder, or one exported file.
 
 What a file holds is data. Of its descriptions only classes of sdfhub and of trusted packages are built.
-
-A run's folder:
-
-config.yaml       the composed config, interpolations resolved but those of the environment
-split.json        ids of the shapes by role; training ids in the order of the code table
-frames.json       which axis is up, and where the training shapes lie in their sources' frames
-checkpoints/      last.ckpt and others: weights, and the description of the model
-metrics.json, metrics.csv, meshes/, contact_sheet.png, what the loggers write
+In `split.json` training ids are in the order of the code table.
 """
 
 import json

@@ -56,15 +56,12 @@ def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str =
     grid, nodes = _grid(_as_fields(field), range(1), resolution, None, device), resolution**3
     keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
     values = np.concatenate([grid.evaluate(part) for part in keys])
-    return grid.to_frame(*_march(values.reshape((resolution,) * 3)))
+    has_surface, volume = values.min() <= 0 < values.max(), values.reshape((resolution,) * 3)
+    return grid.to_frame(*(marching_cubes(volume, 0.0)[:2] if has_surface else _EMPTY))
 
 
 def sdf_slice(
-    field: Field,
-    axis: int = 1,
-    offset: float = 0.0,
-    resolution: int = 256,
-    device: str | torch.device = "cpu",
+    field: Field, axis: int = 1, offset: float = 0.0, resolution: int = 256, device: Any = "cpu"
 ) -> np.ndarray:
     """The field [resolution, resolution] float32 on a plane across `axis`, `offset` from the origin.
 
@@ -88,13 +85,8 @@ def _as_fields(field: Field) -> Fields:
     return lambda points, shapes: field(points.flatten(0, 1)).unflatten(0, points.shape[:2])
 
 
-def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices, in grid steps, and outward faces of [n, n, n] float32; empty where nothing crosses zero."""
-    return marching_cubes(volume, 0.0)[:2] if volume.min() <= 0 < volume.max() else _EMPTY
-
-
 def _march_cells(cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int) -> tuple[Any, Any]:
-    """The same of cells alone: keys [M] of their lowest nodes, and [K] of nodes with values [K] there."""
+    """Vertices in grid steps and faces of cells [M], keys of lowest nodes, from values [K] at nodes [K]."""
     if not len(cells):
         return _EMPTY
     cells, nodes = np.stack(indices(cells, n)), np.stack(indices(nodes, n))

@@ -65,24 +65,20 @@ class Calibration:
             raise SdfhubError(f"the run's data has {len(shapes)} unseen shapes, a calibration needs 3")
         for kind in missing:
             log.info("calibration: %s: fits %d unseen shapes, once", kind, len(shapes))
-            known[str(kind)] = self._measured(kind, shapes, reconstructor)
+            residuals, doubts = [], []
+            scans = kind.observations(shapes, reconstructor.evidence)
+            for scan in tqdm(scans, desc="calibrating", unit="scan", leave=False, disable=None):
+                fitted = reconstructor.fitted([scan])
+                residuals.append(float(fitted.residuals))
+                doubts.append(float(reconstructor.doubts(fitted)))
+            found = {"residual": self.limit(np.array(residuals)), "doubt": self.limit(np.array(doubts))}
+            known[str(kind)] = {"limits": found, "residuals": residuals, "doubts": doubts}
+            known[str(kind)]["shapes"] = [shape.id for shape in shapes]
             try:
                 write_whole(run / FILE, json.dumps(kept, indent=1))
             except OSError as error:  # another user's run: the limits serve this command at least
                 log.warning("%s: is not kept: %s", run / FILE, error.strerror)
         return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
-
-    def _measured(self, kind: ScanKind, shapes: list[StoredShape], reconstructor: Reconstructor) -> dict:
-        """Limits for a kind of scan, and the residuals and doubts of unseen shapes that they come from."""
-        scans = kind.observations(shapes, reconstructor.evidence)
-        residuals, doubts = [], []
-        for scan in tqdm(scans, desc="calibrating", unit="scan", leave=False, disable=None):
-            fitted = reconstructor.fitted([scan])
-            residuals.append(float(fitted.residuals))
-            doubts.append(float(reconstructor.doubts(fitted)))
-        limits = {"residual": self.limit(np.array(residuals)), "doubt": self.limit(np.array(doubts))}
-        ids = [shape.id for shape in shapes]
-        return {"limits": limits, "residuals": residuals, "doubts": doubts, "shapes": ids}
 
 
 def digest(run: Path, settings: dict[str, Any]) -> str:

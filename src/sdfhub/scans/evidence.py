@@ -36,17 +36,15 @@ class Evidence:
     rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
     samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
     surface: Share = 0.25  # of them on the surface
-    uniform: Share = 0.15  # of them anywhere in the cube, or in the space a sensor saw to be empty
+    uniform: Share = (
+        0.15  # of them, as far as the surface leaves any, in the cube, or where a sensor saw it empty
+    )
     # squared standard deviations of the jitter of the others, normalised units squared
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
     cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
     certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
     background: bool = False  # whether a sensor's rays beside those that met something crossed empty space
     quiet: NonNegativeFloat = 0.003  # noise below this is none: a smooth surface's curvature looks like it
-
-    def __post_init__(self):
-        if self.surface + self.uniform > 1:
-            raise ValueError("surface and uniform must be shares that leave room for each other")
 
     def of_samples(self, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> Observation:
         """From points [N, 3] and their signed distances [N], on both sides: half of the samples inside."""

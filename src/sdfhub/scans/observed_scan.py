@@ -72,10 +72,8 @@ def _observe_mesh(scan: Scan, faces, evidence: Evidence, frame: ScanFrame, rng) 
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
     prepared = prepare_mesh((scan.points, faces), preparation)
     points, sdf, own = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64), prepared.frame
-    if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
-        samples = Scan(own.to_source(points), sdf=sdf / own.scale)
-    else:
-        samples, frame = Scan(points, sdf=sdf, frame=own), NORMALIZED
+    frame = frame if isinstance(frame, Frame) else own
+    samples = Scan(own.to_source(points), sdf=sdf / own.scale)
     return replace(observe(samples, evidence, frame, rng), count=len(scan.points))
 
 
