@@ -27,21 +27,19 @@ class Described:
 
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
-        if "__init__" in vars(cls):
-            cls.__init__ = _remembering(cls.__init__)  # type: ignore[method-assign]
+        if "__init__" not in vars(cls):
+            return
+        initialise: Any = cls.__init__
+        signature = inspect.signature(initialise)
 
+        @functools.wraps(initialise)
+        def remember(self, *arguments: Any, **named: Any) -> None:
+            given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
+            check_arguments(initialise, given, type(self).__name__)
+            self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
+            initialise(self, *arguments, **named)
 
-def _remembering(initialise: Callable) -> Callable:
-    signature = inspect.signature(initialise)
-
-    @functools.wraps(initialise)
-    def remember(self, *arguments: Any, **named: Any) -> None:
-        given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
-        check_arguments(initialise, given, type(self).__name__)
-        self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
-        initialise(self, *arguments, **named)
-
-    return remember
+        cls.__init__ = remember  # type: ignore[method-assign]
 
 
 def describe(value: Any, key: str = "") -> Any:

@@ -97,9 +97,7 @@ class Space:
         """The code [L] of a shape, or the codes [B, L] of several."""
         if isinstance(shape, str | int | np.integer):
             return self.codes[self.row(shape)]
-        if isinstance(shape, Sequence):
-            if not shape:
-                raise SdfhubError("no shape is named")
+        if isinstance(shape, Sequence) and len(shape):
             return torch.stack([self._single_code(item) for item in shape])
         code, size = self._tensor(shape), self.codes.shape[1]
         if code.dim() not in (1, 2) or code.shape[-1] != size:

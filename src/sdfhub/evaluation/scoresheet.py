@@ -17,7 +17,7 @@ from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-COLUMNS = {
+COLUMNS = {  # of the printed table: headings and factors; files carry all metrics, without factors
     "cd": ("CD x10^3", 1e3),
     "floor": ("floor", 1e3),
     "excess": ("excess", 1e3),
@@ -26,7 +26,6 @@ COLUMNS = {
     "sdf_error": ("|f-d| x10^3", 1e3),
     "sign_accuracy": ("signs right", 1),
 }
-"""Metrics of the printed table, their headings and factors; the files carry all of them, without factors."""
 
 TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
 
@@ -60,13 +59,10 @@ def write_scores(
     if any(isinstance(row.metrics, DistanceMetrics) for row in judged):
         log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     if pictures := [row.pictures for row in judged if row.pictures]:
-        labels, captions = (
-            ["ground truth", "reconstruction"],
-            [_caption(row) for row in judged if row.pictures],
-        )
+        captions = [_caption(row) for row in judged if row.pictures]
+        labels = ["ground truth", "reconstruction"]
         contact_sheet(list(zip(*pictures, strict=True)), labels, captions, out / "contact_sheet.png")
-    # last: a run that has it is finished
-    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
+    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))  # last: the run is finished
     log.info("\nscores, meshes and contact sheet: %s", out)
     return result
 

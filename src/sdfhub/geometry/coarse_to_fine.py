@@ -66,8 +66,7 @@ def sample_blocks(grid: Grid) -> SampledCells:
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
-    Gives keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once and in no
-    order; and the values [K] float32.
+    Keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once, unordered; values [K].
     """
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
@@ -82,7 +81,7 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
         outside = states[nodes] > 0
         marks = _crossed_cells(outside, nodes, grid.n)
         cells, surface = nodes[:, :2, :2, :2][marks], marks.any(axis=(1, 2, 3))
-        corners = np.concatenate([cells + _distance(corner, grid.n) for corner in _CHILDREN[:, 1:]])
+        corners = np.concatenate([cells + int(c @ [grid.n**2, grid.n, 1]) for c in _CHILDREN[:, 1:]])
         if _evaluate(grid, corners, states, samples):
             blocks, crossed = np.argwhere(active).astype(grid.integers), crossed[:1]
         else:
@@ -103,13 +102,8 @@ def _inferred_states(grid: Grid, sampled: SampledCells) -> np.ndarray:
         sure = sampled.decides(np.sqrt(squared))
         near, signs = centres[sure], inferred[sure]
         for offset in offsets[np.square(offsets).sum(axis=1) == squared]:
-            states[near + _distance(offset, grid.n)] = signs
+            states[near + int(offset @ [grid.n**2, grid.n, 1])] = signs
     return states
-
-
-def _distance(offset: np.ndarray, n: int) -> int:
-    """Difference of the keys of two nodes that lie steps [3] along the axes apart."""
-    return int(offset @ [n * n, n, 1])
 
 
 def _node_keys(cells: np.ndarray, stride: int, steps: Sequence[int], n: int) -> np.ndarray:

@@ -15,8 +15,7 @@ import torch
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh
 
-Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-"""Maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 to signed distances [B, N]."""
+Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]  # points [B, N, 3], shapes [B] -> [B, N]
 
 TILE = 1024  # points of a shape in a row of a call: shapes need unequal numbers of them, and share calls
 

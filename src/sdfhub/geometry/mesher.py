@@ -1,7 +1,5 @@
 """From fields to meshes: marching cubes at the zero level, dense or coarse to fine, one shape or many.
 
-Grid: `resolution` nodes along each axis of the cube [-1, 1]^3, both end points included.
-
 Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with Topological Guarantees, 2003
 (the triangles of a cell; scikit-image's implementation).
 """
@@ -17,8 +15,7 @@ from sdfhub.geometry.coarse_to_fine import evaluate_crossed_cells, sample_blocks
 from sdfhub.geometry.grid import Fields, Grid, indices
 from sdfhub.shapes import Mesh
 
-Field = Callable[[torch.Tensor], torch.Tensor]
-"""Maps points [N, 3] float32, normalised frame, to signed distances [N], negative inside."""
+Field = Callable[[torch.Tensor], torch.Tensor]  # points [N, 3] float32 -> signed distances [N]
 
 _EMPTY = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape

@@ -18,7 +18,6 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-FAILURES = "without a surface: one point at the origin in the statistics `with_failures`, in no others"
 STATISTICS: dict[str, Callable[..., Any]] = {
     "mean": np.mean,
     "median": np.median,
@@ -142,7 +141,10 @@ def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, An
     summary: dict[str, Any] = {"shapes": len(metrics)}
     rows = [row for row in metrics if isinstance(row, ShapeMetrics)]
     if len(rows) == len(metrics):
-        summary |= {"failed": sum(row.failed for row in rows), "failures": FAILURES}
+        summary |= {"failed": sum(row.failed for row in rows)}
+        summary["failures"] = (
+            "one point at the origin in the statistics with_failures, left out of all others"
+        )
         with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
         for name in ("mean", "median"):
             summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -44,7 +43,9 @@ def contact_sheet(
             place = 10, top + band + size / 2
             ImageDraw.Draw(page).text(place, row_labels[i], fill=_INK, font=font, anchor="lm")
         top += band + size
-    return _write(page, path)
+    with whole_file(path) as file:
+        page.save(file, "PNG")
+    return path
 
 
 def animation(images: Sequence[np.ndarray], path: Path, seconds: float = 2.0) -> Path:
@@ -53,10 +54,6 @@ def animation(images: Sequence[np.ndarray], path: Path, seconds: float = 2.0) ->
     frames = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     frames += frames[-2:0:-1]
     duration = round(1000 * seconds / max(1, len(images) - 1))
-    return _write(frames[0], path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
-
-
-def _write(picture: Image.Image, path: Path, **settings: Any) -> Path:
     with whole_file(path) as file:
-        picture.save(file, format=path.suffix[1:], **settings)
+        frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
     return path

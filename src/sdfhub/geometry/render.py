@@ -1,7 +1,4 @@
-"""Meshes to pictures by ray casting, without a display.
-
-Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +y up are turned first.
-"""
+"""Meshes within the unit ball, +z up, front towards -y, to pictures by ray casting, without a display."""
 
 import igl
 import numpy as np

@@ -20,10 +20,7 @@ KNOWN = 5e-3  # bounds no further apart than this, normalised frame, make a sign
 
 @dataclass(frozen=True)
 class DeepSdfFit:
-    """Adam on fresh samples at every step, half of them inside.
-
-    Source: DeepSDF's published code.
-    """
+    """Adam on fresh samples at every step, half of them inside. Source: DeepSDF's published code."""
 
     steps: PositiveInt = 800
     lr: PositiveFloat = 5e-3

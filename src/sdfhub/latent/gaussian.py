@@ -26,10 +26,6 @@ class Gaussian:
         mean variance in all directions), gives those that they lack.
 
         Source: Ledoit and Wolf 2004, with a given share in place of their estimate.
-
-        >>> codes = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [3.0, 1.0]])
-        >>> Gaussian.of(codes).mean
-        tensor([1.5000, 0.5000])
         """
         precise = codes.detach().double()
         mean = precise.mean(0)

@@ -28,10 +28,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 @dataclass(frozen=True)
 class Evidence:
-    """How an observation is made of a scan.
-
-    Source: the jitter of points near the surface is DeepSDF's (its published code).
-    """
+    """How an observation is made of a scan. Source of the jitter near surfaces: DeepSDF's published code."""
 
     rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
     samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
@@ -39,8 +36,7 @@ class Evidence:
     uniform: Share = (
         0.15  # of them, as far as the surface leaves any, in the cube, or where a sensor saw it empty
     )
-    # squared standard deviations of the jitter of the others, normalised units squared
-    variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
+    variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)  # of near ones
     cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
     certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
     background: bool = False  # whether a sensor's rays beside those that met something crossed empty space

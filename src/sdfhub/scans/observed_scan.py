@@ -15,8 +15,7 @@ from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, Frame, Observation
 
-ScanFrame = Frame | Literal["shape", "unknown"]
-"""How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
+ScanFrame = Frame | Literal["shape", "unknown"]  # a known one, as the scan's own box tells, or nobody knows
 
 MOST = 2**16  # points of a cloud that are used: a random draw of more
 LARGEST, SMALLEST = 1.2, 0.2  # distance of the farthest point from the origin, normalised frame
@@ -42,10 +41,8 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
         return _observe_mesh(scan, scan.faces, evidence, frame, rng)
     if scan.kind == "view" and frame == "shape":
         raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
-    if isinstance(frame, Frame):
-        lies = frame
-    else:
-        lies = NORMALIZED if scan.sdf is not None else _box_frame(scan.points)
+    own = None if scan.sdf is None else NORMALIZED
+    lies = frame if isinstance(frame, Frame) else own or _box_frame(scan.points)
     points = lies.to_normalized(scan.points)
     _refuse_misplaced(points, LARGEST if scan.sdf is None else FAR)
     if np.ptp(points, axis=0).max() < SMALLEST:

@@ -80,7 +80,9 @@ def read_scan(path: str | Path) -> Scan:
     try:
         if suffix == ".npz":
             return _archive(path)
-        if suffix in readers and not (suffix == ".ply" and _has_faces(path)):
+        header = path.read_bytes().partition(b"end_header")[0] if suffix == ".ply" else b""
+        has_faces = re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE)
+        if suffix in readers and not has_faces:
             return _cloud(readers[suffix](path))
         mesh = read_mesh(path)
         return Scan(mesh[0], faces=mesh[1])
@@ -98,11 +100,6 @@ def _cloud(rows: np.ndarray) -> Scan:
         raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
     rows = rows.astype(np.float64)
     return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
-
-
-def _has_faces(path: Path) -> bool:
-    header = path.read_bytes().partition(b"end_header")[0]
-    return bool(re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE))
 
 
 def _ply_rows(path: Path) -> np.ndarray:
