@@ -66,7 +66,7 @@ def sample_blocks(grid: Grid) -> SampledCells:
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
-    Keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once, unordered; values [K].
+    Keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once; values [K].
     """
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
