@@ -101,7 +101,7 @@ class Space:
             return torch.stack([self._single_code(item) for item in shape])
         code, size = self._tensor(shape), self.codes.shape[1]
         if code.dim() not in (1, 2) or code.shape[-1] != size:
-            raise SdfhubError(f"a shape is an id, a row or a tensor of {size} numbers; got {list(code.shape)}")
+            raise SdfhubError(f"a shape is an id, row or tensor of {size} numbers; got {list(code.shape)}")
         return code
 
     def _single_code(self, shape: Shape) -> Tensor:
