@@ -39,7 +39,7 @@ class Described:
             self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
             initialise(self, *arguments, **named)
 
-        cls.__init__ = remember  # type: ignore[method-assign]
+        cls.__init__ = typing.cast(Any, remember)  # type: ignore[method-assign]
 
 
 def describe(value: Any, key: str = "") -> Any:
