@@ -31,8 +31,8 @@ from sdfhub.evaluation.judging import Evaluation, evaluate_model
 from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
-from sdfhub.multirun.cells import go_on, run_cell
 from sdfhub.multirun.search import objective
+from sdfhub.multirun.sweep import go_on, run_cell
 from sdfhub.opening import begin_run, read_run
 from sdfhub.settings import WHERE_NOT_WHAT, flat
 
