@@ -65,8 +65,9 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = ["{}, {}{}".format(*parts) for parts in zip(means, medians, seeds, strict=True)]
-            texts = [NONE if text == f"{NONE}, {NONE}" else text for text in texts]
+            texts = [
+                NONE if a == NONE else f"{a}, {b}{n}" for a, b, n in zip(means, medians, seeds, strict=True)
+            ]
             frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
         if (frame.iloc[:, 1:] != NONE).any(axis=None):
             overviews.append(Table(f"{TITLES[role]}, excess", frame, ABOUT_OVERVIEW))
@@ -171,16 +172,15 @@ def markdown(title: str, tables: list[Table]) -> str:
 
 def latex(sections: list[tuple[str, list[Table]]]) -> str:
     """A document of titled tables that compiles; each table can be copied out (booktabs)."""
-    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs,graphicx}"]
-    lines += [r"\usepackage[landscape,margin=1.5cm]{geometry}", r"\begin{document}"]
+    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs}"]
+    lines += [r"\usepackage[landscape,margin=1cm]{geometry}", r"\begin{document}\scriptsize"]
     for title, tables in sections:
         for table in tables:
             frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
             form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
-            lines += [r"\begin{table}[p]\centering", rf"\caption{{{_latex_text(f'{table.title}: {title}')}}}"]
-            lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
-            lines += [frame.to_latex(index=False, escape=False, column_format=form) + "}"]
-            lines += [rf"\par\smallskip\footnotesize {_latex_text(table.note)}", r"\end{table}"]
+            caption = _latex_text(f"{table.title}: {title}. {table.note}")
+            options = {"column_format": form, "position": "p", "caption": caption}
+            lines += [frame.to_latex(index=False, escape=False, **options)]
     return "\n".join([*lines, r"\end{document}", ""])
 
 
