@@ -40,8 +40,8 @@ class Row:
 
     def __post_init__(self) -> None:
         words = {"on": " + normals", "off": ", no normals" if self.method != "DeepSDF" else ""}
-        words = words.get(self.normals, f", normals {self.normals}")  # labels name rows: no two are equal
-        self.label = self.method + words + (f" ({self.detail})" if self.detail else "")
+        ending = words.get(self.normals, f", normals {self.normals}")  # labels name rows: no two are equal
+        self.label = self.method + ending + (f" ({self.detail})" if self.detail else "")
         self.done = [cell for cell in self.cells if cell.state == "done"]
         self.first = self.done[0] if self.done else None
         # what stands for a row without finished cells, and what search its settings come from

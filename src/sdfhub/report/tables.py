@@ -48,7 +48,15 @@ def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
     kinds = (("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES))
     scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
-    return [table for table in (*scores, _settings(group), _costs(group), _absent(group)) if table]
+    first = {row.label: settings_of(row.first) for row in group.rows if row.first}
+    lines = sorted((key, *values) for key, values in differing(list(first.values())).items())
+    settings = pd.DataFrame(lines, columns=["setting", *first])
+    cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
+    reasons = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
+    absent = pd.DataFrame(reasons, columns=["cell", "state", "reason"])
+    prose = [Table("Settings that differ", settings, ABOUT_SETTINGS, prose=True), _costs(group)]
+    prose += [Table("Not there", absent, prose=True)]
+    return [table for table in (*scores, *prose) if table and len(table.frame)]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -110,13 +118,6 @@ def _scores(group: Group, role: str, title: str, quantities: dict[str, str], abo
     return Table(TITLES[role] + title, _frame(group, columns), about, best)
 
 
-def _settings(group: Group) -> Table | None:
-    rows = {row.label: settings_of(row.first) for row in group.rows if row.first}
-    lines = sorted((key, *values) for key, values in differing(list(rows.values())).items())
-    frame = pd.DataFrame(lines, columns=["setting", *rows])
-    return Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True) if lines else None
-
-
 def _costs(group: Group) -> Table:
     lines = group.costs.reindex([row.label for row in group.rows])
     names = {"shapes": "trained_on"} | {name: name for name in ("parameters", "epochs", "steps", "samples")}
@@ -126,13 +127,6 @@ def _costs(group: Group) -> Table:
         for mean, half in zip(lines["seconds"], lines["seconds_ci95"], strict=True)
     ]
     return Table("Cost", _frame(group, columns), ABOUT_COSTS)
-
-
-def _absent(group: Group) -> Table | None:
-    cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
-    lines = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
-    frame = pd.DataFrame(lines, columns=["cell", "state", "reason"])
-    return Table("Not there", frame, prose=True) if lines else None
 
 
 def _frame(group: Group, columns: dict[str, list[str]]) -> pd.DataFrame:
