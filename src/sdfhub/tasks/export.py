@@ -81,7 +81,13 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
             import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-        names: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
-        program = torch.onnx.export(function, dynamo=True, verbose=False, **names)
+        options: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+        program = torch.onnx.export(function, dynamo=True, verbose=False, **options)
         assert program
-        return program.model_proto.SerializeToString()
+        model = program.model_proto
+        values = [*model.graph.input, *model.graph.output, *model.graph.value_info]
+        axes = [axis for value in values for axis in value.type.tensor_type.shape.dim]
+        names = {axis.dim_param: name for axis, name in zip(axes[:2], "BN", strict=True)}  # of `points`
+        for axis in [axis for axis in axes if axis.dim_param in names]:
+            axis.dim_param = names[axis.dim_param]
+        return model.SerializeToString()
