@@ -33,14 +33,16 @@ class TrainingRecord(L.Callback):
             self.stepped, self._started = True, time.perf_counter()
         self._losses.append(outputs["loss"])
 
-    def on_train_end(self, *_: Any) -> None:
+    def stop_clock(self, *_: Any) -> None:
+        """Counts no seconds from now on."""
         self._seconds, self._started = self._so_far(), None
 
-    def on_validation_end(self, *_: Any) -> None:
+    def start_clock(self, *_: Any) -> None:
+        """Counts seconds again, if the first step has been."""
         self._started = time.perf_counter() if self.stepped else None
 
-    stop_clock = on_validation_start = on_train_end
-    start_clock = on_validation_end
+    on_validation_start = on_train_end = stop_clock  # type: ignore[assignment]
+    on_validation_end = start_clock  # type: ignore[assignment]
 
     def _so_far(self) -> float:
         return self._seconds + (time.perf_counter() - self._started if self._started else 0.0)

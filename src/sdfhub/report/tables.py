@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 
@@ -173,7 +174,7 @@ def latex(sections: list[tuple[str, list[Table]]]) -> str:
             frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
             form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
             caption = _latex_text(f"{table.title}: {title}. {table.note}")
-            options = {"column_format": form, "position": "p", "caption": caption}
+            options: Any = {"column_format": form, "position": "p", "caption": caption}
             lines += [frame.to_latex(index=False, escape=False, **options)]
     return "\n".join([*lines, r"\end{document}", ""])
 
