@@ -19,10 +19,9 @@ import torch
 from runs import OUTPUTS, head, row, train
 
 import sdfhub
-from sdfhub.data.loading.batches import signed_samples
 from sdfhub.data.splits import split
 from sdfhub.data.store.store import shape_seed
-from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape, signed_samples
 from sdfhub.geometry.metrics import judge
 from sdfhub.latent.deepsdf_fit import DeepSdfFit
 from sdfhub.latent.fitting import Fit

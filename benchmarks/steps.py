@@ -7,8 +7,7 @@ import torch
 from hydra import compose
 
 from sdfhub.composition import instantiate
-from sdfhub.data.loading.batches import Loading, StepBatches
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Loading, ResidentBatches, StepBatches
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import distances
 from sdfhub.model.fast.side_by_side import side_by_side

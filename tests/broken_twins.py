@@ -95,7 +95,7 @@ def signed_distance(clean: Mesh, points: np.ndarray) -> np.ndarray:
 
 def errors(samples: ShapeSamples, clean: Mesh, count: int = 20_000) -> tuple[float, float]:
     """Share of right signs and mean error of the distance, normalised units, of the first `count` samples."""
-    source = samples.points[:count].astype(np.float64) / samples.scale + samples.center
-    truth = signed_distance(clean, source) * samples.scale
+    source = samples.points[:count].astype(np.float64) / samples.frame.scale + samples.frame.center
+    truth = signed_distance(clean, source) * samples.frame.scale
     sdf = samples.sdf[:count]
     return float(np.mean((sdf < 0) == (truth < 0))), float(np.mean(np.abs(sdf - truth)))

@@ -74,7 +74,7 @@ def test_without_a_trainer_epochs_end_and_go_on(store):
         _ = data.rows
     data.prepare_data()
     data.setup("fit")
-    assert (data.rows, data.steps_per_epoch, len(data.held_out_shapes)) == (6, STEPS, 2)
+    assert (data.rows, len(data.batches), len(data.held_out_shapes)) == (6, STEPS, 2)
     loader = data.train_dataloader()
     batches = [batch for _ in range(2) for batch in loader]
     assert len(loader) == STEPS and len(batches) == 2 * STEPS

@@ -25,8 +25,7 @@ from sdfhub.data import fetch
 from sdfhub.data.sources.deepsdf import read_samples
 from sdfhub.data.sources.mesh_files import triangles_of
 from sdfhub.data.sources.open import furniture_in, read_model
-from sdfhub.data.sources.source import Shape
-from sdfhub.data.sources.split_file import with_roles
+from sdfhub.data.sources.source import Shape, with_roles
 from sdfhub.data.store.store import Store
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import read_run

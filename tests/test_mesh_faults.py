@@ -146,7 +146,7 @@ def through_a_file(vertices: np.ndarray, faces: np.ndarray, path: Path):
 def test_neither_size_nor_place_of_a_file_matters(scale, shift, tmp_path):
     vertices, faces = CHAIR
     samples = through_a_file(vertices * scale + shift * scale, faces, tmp_path / "chair.obj")
-    frame = Frame(samples.center / scale - shift, samples.scale * scale)
+    frame = Frame(samples.frame.center / scale - shift, samples.frame.scale * scale)
     right, error = errors(dataclasses.replace(samples, frame=frame), CHAIR)
     assert right >= 0.999 and error < 1e-5
 

@@ -205,9 +205,10 @@ def test_ac3d_believes_no_claims(claim):
         read_ac3d(AC3D.replace(b"numvert 4", claim))
 
 
-def test_ac3d_nests_only_so_deep():
-    with pytest.raises(RejectedMesh, match="deep"):
-        read_ac3d(b"AC3Db\n" + b"OBJECT group\nkids 1\n" * 5000)
+def test_ac3d_nests_as_deep_as_it_likes():
+    deep = b"AC3Db\n" + b"OBJECT group\nloc 1 0 0\nkids 1\n" * 5000
+    vertices, faces = read_ac3d(deep + AC3D[AC3D.rindex(b"OBJECT poly") :])
+    assert faces.tolist() == [[0, 1, 2]] and vertices[0].tolist() == [5000, 0, 0]
 
 
 @pytest.mark.parametrize("away", [0.0, 4e6])

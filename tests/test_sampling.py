@@ -102,8 +102,8 @@ def test_distances_are_exact_for_the_points_as_stored():
 
 def test_surface_points_lie_on_the_surface_with_outward_normals():
     samples = prepare_mesh(BREAKAGES["all of it"](CHAIR, np.random.default_rng(0)), FEW)
-    source = samples.surface_points / samples.scale + samples.center
-    step = 2e-3 / samples.scale * samples.surface_normals
+    source = samples.surface_points / samples.frame.scale + samples.frame.center
+    step = 2e-3 / samples.frame.scale * samples.surface_normals
     outside, inside = signed_distance(CHAIR, source + step), signed_distance(CHAIR, source - step)
     assert np.abs(signed_distance(CHAIR, source)).max() < 1e-6
     assert np.mean((outside > 0) & (inside < 0)) > 0.995
@@ -125,8 +125,8 @@ def test_scale_and_place_of_the_source_do_not_matter(size):
     moved = prepare_mesh((vertices * size + 3 * size, faces), FEW)
     plain = prepare_mesh(CHAIR, FEW)
     np.testing.assert_allclose(moved.sdf, plain.sdf, atol=1e-6)
-    np.testing.assert_allclose(moved.center / size - 3, plain.center, atol=1e-9)
-    assert moved.scale * size == pytest.approx(plain.scale)
+    np.testing.assert_allclose(moved.frame.center / size - 3, plain.frame.center, atol=1e-9)
+    assert moved.frame.scale * size == pytest.approx(plain.frame.scale)
 
 
 def test_a_trimesh_and_unmerged_triangles_give_the_same_samples():
@@ -148,11 +148,11 @@ def test_sheets_count_for_distance_but_have_no_inside():
     )
     samples = prepare_mesh(both, FEW)
     assert 0.02 < samples.statistics["two_sided_area"] < 0.25
-    source = samples.points / samples.scale + samples.center
+    source = samples.points / samples.frame.scale + samples.frame.center
     around = np.abs(source[:, 2] - 0.1) < 0.3
     assert (samples.sdf[around] >= 0).all()
-    assert samples.sdf[around].min() / samples.scale < 0.005
-    on_box = samples.surface_points[:, 2] / samples.scale + samples.center[2]
+    assert samples.sdf[around].min() / samples.frame.scale < 0.005
+    on_box = samples.surface_points[:, 2] / samples.frame.scale + samples.frame.center[2]
     assert on_box.max() < -1.09
 
 

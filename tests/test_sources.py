@@ -179,7 +179,7 @@ def test_deepsdf_samples_keep_sign_and_frame(tmp_path):
     assert ids(source) == ["ShapeNetV2_00000001/bb", "ShapeNetV2_03001627/aa"]
     samples = source.load(source.shapes()[1])
     assert (samples.sdf < 0).sum() == 40 and len(samples.points) == 140 and samples.mesh is None
-    assert samples.center.tolist() == [-1, -2, -3] and samples.scale == 2
+    assert samples.frame.center.tolist() == [-1, -2, -3] and samples.frame.scale == 2
     assert len(samples.surface_points) == 0
 
 

@@ -10,8 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch._dynamo.backends.common import aot_autograd
 
-from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Augmentation, Loading, ResidentBatches, StepBatches
 from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Hosc, Relu, Siren
 from sdfhub.model.decoder import activated
@@ -273,7 +272,8 @@ def test_what_does_not_compile_runs_as_it_is_unless_it_was_asked_for(part, monke
     plain = dict.fromkeys(("fw_compiler", "bw_compiler"), lambda graph, inputs: graph)
     backend = aot_autograd(**plain | {f"{part[0]}w_compiler": refuse})
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
-    monkeypatch.setattr(computing, "can_compile", lambda device: True)
+    monkeypatch.setattr(computing, "find_spec", lambda name: object())
+    monkeypatch.setattr(computing.shutil, "which", lambda name: "/usr/bin/cc")
     (wave,) = Computing().compiled(lambda x: x * x.sin(), device=torch.device("cuda"))
     x = torch.ones(3, requires_grad=True)
     wave(x).sum().backward()

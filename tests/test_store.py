@@ -95,7 +95,7 @@ def test_mesh_and_frame_survive(tmp_path):
     expected = ball(0).mesh
     assert np.array_equal(shape.mesh.vertices, expected.vertices) and shape.mesh.faces.dtype == np.int64
     assert np.array_equal(shape.mesh.faces, expected.faces)
-    assert shape.scale == 2.0 and shape.center.tolist() == [1.0, 2.0, 3.0]
+    assert shape.frame.scale == 2.0 and shape.frame.center.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_neither_order_nor_workers_change_a_byte(tmp_path):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches, draw_rows
+from sdfhub.data.loading.batches import Augmentation, Loading, StepBatches
 from sdfhub.data.loading.datamodule import EpochSteps
+from sdfhub.data.store.stored_shape import draw_rows
 from sdfhub.errors import SdfhubError
 from sdfhub.model.losses import SdfLoss, clamped_l1, code_prior, normal_term
 from sdfhub.model.optimisers import Cosine, Optimisation, StepDecay

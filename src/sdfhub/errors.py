@@ -11,16 +11,13 @@ class SdfhubError(Exception):
 class RejectedMesh(SdfhubError):
     """A mesh from which no trustworthy signed distances can be made.
 
-    Attributes:
-        reason: short name of the rule that refused it, such as `non_finite_vertices`;
-            summaries and manifests count by it.
-        detail: the measured value and the limit, for a reader.
+    Its `reason` is the short name of the rule that refused it, such as `non_finite_vertices`, by which
+    summaries count; its `detail` says what was measured and what is the limit.
     """
 
     def __init__(self, reason: str, detail: str):
         super().__init__(f"{reason}: {detail}")
-        self.reason = reason
-        self.detail = detail
+        self.reason, self.detail = reason, detail
 
     def __reduce__(self):  # an exception with two arguments must say how it crosses processes
         return type(self), (self.reason, self.detail)

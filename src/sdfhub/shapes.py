@@ -24,11 +24,15 @@ def check_id(id: str) -> None:
         raise ValueError(f"shape id {id!r}: parts must be letters, digits or _ . + -")
 
 
-def _check(name: str, array: Any, shape: tuple[int | None, ...], dtype: Any) -> None:
-    fits = len(array.shape) == len(shape)
-    fits = fits and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
-    if not fits or array.dtype != dtype:
-        raise ValueError(f"{name}: expected {list(shape)} {dtype}, got {list(array.shape)} {array.dtype}")
+def _check(owner: Any, **layouts: tuple) -> None:
+    """Raises ValueError where a field has other sizes (a letter stands for one), or another dtype (last)."""
+    sizes: dict[Any, int] = {}
+    for name, (*layout, dtype) in layouts.items():
+        array = getattr(owner, name)
+        pairs = zip(layout, array.shape, strict=False)
+        fits = all((want if want == 3 else sizes.setdefault(want, have)) == have for want, have in pairs)
+        if not fits or len(array.shape) != len(layout) or array.dtype != dtype:
+            raise ValueError(f"{name}: expected {layout} {dtype}, got {list(array.shape)} {array.dtype}")
 
 
 class Mesh(NamedTuple):
@@ -46,7 +50,7 @@ class Frame:
     scale: float  # normalised units per source unit, > 0
 
     def __post_init__(self) -> None:
-        _check("center", self.center, (3,), np.float64)
+        _check(self, center=(3, np.float64))
         if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
             raise ValueError(f"frame: no finite center {self.center} and positive scale {self.scale}")
 
@@ -54,8 +58,7 @@ class Frame:
     def around(cls, points: np.ndarray) -> tuple["Frame", np.ndarray]:
         """The frame that centres the bounding box of points [N, 3], and the points in it [N, 3].
 
-        Raises:
-            ValueError: the points lie in one place, or too far apart to be measured.
+        Raises ValueError where the points lie in one place, or too far apart to be measured.
         """
         low, high = points.min(axis=0), points.max(axis=0)
         half, center = high / 2 - low / 2, high / 2 + low / 2  # halves first: a sum may overflow
@@ -76,22 +79,8 @@ class Frame:
 NORMALIZED = Frame(np.zeros(3), 1.0)  # of a shape that has no source
 
 
-class InFrame:
-    """Data in a normalised frame, with the centre [3] and the scale of the way back to its source's."""
-
-    frame: Frame
-
-    @property
-    def center(self) -> np.ndarray:
-        return self.frame.center
-
-    @property
-    def scale(self) -> float:
-        return self.frame.scale
-
-
 @dataclass(frozen=True)
-class NormalizedMesh(InFrame):
+class NormalizedMesh:
     """A triangle mesh in the normalised frame."""
 
     vertices: np.ndarray  # [V, 3] float64, all within the unit ball
@@ -99,8 +88,7 @@ class NormalizedMesh(InFrame):
     frame: Frame = NORMALIZED
 
     def __post_init__(self) -> None:
-        _check("vertices", self.vertices, (None, 3), np.float64)
-        _check("faces", self.faces, (None, 3), np.int64)
+        _check(self, vertices=("V", 3, np.float64), faces=("F", 3, np.int64))
         if not np.linalg.norm(self.vertices, axis=1).max(initial=0) <= 1 + 1e-6:  # also where one is NaN
             raise ValueError("vertices: must be finite and inside the unit ball")
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
@@ -108,7 +96,7 @@ class NormalizedMesh(InFrame):
 
 
 @dataclass(frozen=True)
-class ShapeSamples(InFrame):
+class ShapeSamples:
     """Signed distances and oriented surface points of one shape, normalised frame."""
 
     points: np.ndarray  # [N, 3] float32; jitter leaves the cube [-1, 1]^3 a little
@@ -120,13 +108,16 @@ class ShapeSamples(InFrame):
     statistics: dict[str, float]  # of the preparation (two-sided area, inside fraction, ...)
 
     def __post_init__(self) -> None:
-        n, m = len(self.points), len(self.surface_points)
-        shapes = {"points": (n, 3), "sdf": (n,), "surface_points": (m, 3), "surface_normals": (m, 3)}
-        for name, shape in shapes.items():
-            _check(name, getattr(self, name), shape, np.float32)
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"{name}: must be finite")
-        if m and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3:
+        surface = ("M", 3, np.float32)
+        _check(self, points=("N", 3, np.float32), sdf=("N", np.float32))
+        _check(self, surface_points=surface, surface_normals=surface)
+        arrays = self.points, self.sdf, self.surface_points, self.surface_normals
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise ValueError("samples: all must be finite")
+        if (
+            len(self.surface_normals)
+            and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3
+        ):
             raise ValueError("surface_normals: must have unit length")
 
 
@@ -146,11 +137,11 @@ class Observation:
     partial: bool = False  # whether a part of the shape's surface was not seen
 
     def __post_init__(self) -> None:
-        n = len(self.points)
-        _check("points", self.points, (n, 3), np.float32)
-        for name, dtype in (("low", np.float32), ("high", np.float32), ("unsigned", np.bool_)):
-            _check(name, getattr(self, name), (n,), dtype)
-        if not n or not all(np.isfinite(part).all() for part in (self.points, self.low, self.high)):
+        bound = ("N", np.float32)
+        _check(self, points=("N", 3, np.float32), low=bound, high=bound, unsigned=("N", np.bool_))
+        if not len(self.points) or not all(
+            np.isfinite(part).all() for part in (self.points, self.low, self.high)
+        ):
             raise ValueError("points, low and high: must be finite, at least one")
         if (self.low > self.high).any() or not 0 <= self.noise < np.inf:
             raise ValueError("low must not lie above high, noise must be a number >= 0")
@@ -181,12 +172,9 @@ class Batch:
     def __post_init__(self) -> None:
         import torch  # here: meshes and samples do without it
 
-        b, n = self.points.shape[:2]
-        m = self.surface_points.shape[1]
-        _check("rows", self.rows, (b,), torch.int64)
-        _check("sdf", self.sdf, (b, n), torch.float32)
-        for name, count in (("points", n), ("surface_points", m), ("surface_normals", m)):
-            _check(name, getattr(self, name), (b, count, 3), torch.float32)
+        points, surface = ("B", "N", 3, torch.float32), ("B", "M", 3, torch.float32)
+        _check(self, rows=("B", torch.int64), points=points, sdf=("B", "N", torch.float32))
+        _check(self, points=points, surface_points=surface, surface_normals=surface)
 
     def to(self, device: "torch.device | str", non_blocking: bool = False) -> "Batch":
         """The same batch on another device."""

@@ -16,13 +16,8 @@ from sdfhub.errors import SdfhubError
 def whole_file(path: Path, beside: str | None = None) -> Iterator[BinaryIO]:
     """A file to write that appears at `path` when all of it is on the disk: a reader sees the old or the new.
 
-    Args:
-        path: its folder is made where it is missing.
-        beside: name under which it is written first; None takes a new one. A fixed name keeps leftovers of
-            killed writers from piling up; only one process may then write at a time.
-
-    Raises:
-        OSError: the disk is full or the folder cannot be written; names `path`, which stays as it was.
+    It is written first under the name `beside`; None takes a new one. A fixed name keeps leftovers of killed
+    writers from piling up; only one process may then write at a time. An OSError names `path`.
     """
     part = path.with_name(beside or f".{path.name}.{uuid.uuid4().hex[:12]}")
     try:

@@ -5,7 +5,6 @@ put the two .deb files, or the folders unpacked from them, into the root by hand
 """
 
 import argparse
-import io
 import logging
 import lzma
 import os
@@ -29,26 +28,20 @@ PACKAGES = {"sweethome3d-furniture": ".sh3f", "flightgear-data-ai": ".ac"}
 MAX_MEMBER, MAX_TOTAL = 256 << 20, 2 << 30
 
 
-def fetch(root: str | Path) -> None:
-    """Puts the meshes of both packages below `root`; what is there already stays.
-
-    Raises:
-        SdfhubError: a package is neither there nor can be downloaded; says which files to put where.
-    """
-    root = Path(root)
+def fetch(root: Path) -> None:
+    """Puts the meshes of both packages below `root`; what is there already stays."""
     root.mkdir(parents=True, exist_ok=True)
     with locked(root / ".lock", waiting=f"{root}: waiting for another process that fetches"):
         for leftover in root.glob(".fetch-*"):  # of a run that was killed
             shutil.rmtree(leftover, ignore_errors=True)
         for package, suffix in PACKAGES.items():
-            if any(root.rglob(f"*{suffix}")):
-                continue
-            with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
-                archive = _archive_by_hand(root, package) or _download(package, Path(scratch), root)
-                unpacked = Path(scratch) / "unpacked"
-                count = unpack(archive, unpacked, suffix)
-                os.rename(unpacked, root / package)
-                log.info("%s: %d files in %s", package, count, root / package)
+            if not any(root.rglob(f"*{suffix}")):
+                with tempfile.TemporaryDirectory(prefix=".fetch-", dir=root) as scratch:
+                    archive = _archive(root, package) or _download(package, Path(scratch), root)
+                    unpacked = Path(scratch) / "unpacked"
+                    count = unpack(archive, unpacked, suffix)
+                    os.rename(unpacked, root / package)
+                    log.info("%s: %d files in %s", package, count, root / package)
 
 
 def unpack(archive: Path, folder: Path, suffix: str) -> int:
@@ -64,11 +57,7 @@ def unpack(archive: Path, folder: Path, suffix: str) -> int:
                 total += member.size
                 if member.size > MAX_MEMBER or total > MAX_TOTAL:
                     raise SdfhubError(f"{archive}: {member.name} is larger than anything expected of it")
-                target, content = folder.joinpath(*path.parts), tar.extractfile(member)
-                assert content, "a regular file"
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with target.open("wb") as file:
-                    shutil.copyfileobj(content, file)
+                tar.extract(member, folder, filter="data")
                 count += 1
     except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
         what = f"{archive}: not a whole .deb ({error}); delete it and download it again"
@@ -86,28 +75,27 @@ def _data_tar(archive: Path) -> Iterator[IO[bytes]]:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
             assert process.stdout
             yield process.stdout
-            shutil.copyfileobj(process.stdout, io.BytesIO())  # the padding after the last member
+            while process.stdout.read(1 << 20):  # the padding after the last member
+                pass
         if process.returncode:
             raise ValueError(f"dpkg-deb ended with status {process.returncode}")
         return
     with archive.open("rb") as file:
-        if file.read(8) != b"!<arch>\n":
-            raise ValueError("no ar archive")
-        name, size = "", 0
-        while not name.startswith("data.tar"):  # the last member
+        name, size = file.read(8), 0
+        while not name.startswith(b"data.tar"):  # the last member
             file.seek(size + size % 2, os.SEEK_CUR)
             header = file.read(60)
             if header[58:] != b"`\n":
                 raise ValueError("no data.tar in it")
-            name, size = header[:16].decode("ascii", "replace").strip().rstrip("/"), int(header[48:58])
-        if not name.endswith(".xz"):
-            raise SdfhubError(f"{archive}: {name} needs dpkg-deb; take Debian's package, not Ubuntu's")
+            name, size = header[:16].strip(b" /"), int(header[48:58])
+        if not name.endswith(b".xz"):
+            raise SdfhubError(f"{archive}: needs dpkg-deb; take Debian's package, not Ubuntu's")
         with lzma.open(file) as stream:
             yield stream
 
 
-def _archive_by_hand(root: Path, package: str) -> Path | None:
-    return next(iter(sorted(root.glob(f"{package}*.deb"), reverse=True)), None)
+def _archive(folder: Path, package: str) -> Path | None:
+    return max(folder.glob(f"{package}*.deb"), default=None)
 
 
 def _download(package: str, scratch: Path, root: Path) -> Path:
@@ -121,7 +109,7 @@ def _download(package: str, scratch: Path, root: Path) -> Path:
             # apt hands downloads to a user of its own, who may not enter our folder
             command = ["apt-get", "-q", "-o", "APT::Sandbox::User=", *command]
             done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
-            if archive := _archive_by_hand(scratch, package):
+            if archive := _archive(scratch, package):
                 return archive
             problem = next((line for line in done.stderr.splitlines() if line.startswith("E:")), problem)
     files = " and ".join(f"{name}_*_all.deb" for name in PACKAGES)
@@ -132,11 +120,10 @@ def _download(package: str, scratch: Path, root: Path) -> Path:
 def main(arguments: list[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m sdfhub.data.fetch", description=fetch.__doc__)
-    parser.add_argument("--root", default="data/open", help="where the meshes go (default: %(default)s)")
-    root = parser.parse_args(arguments).root
+    parser.add_argument("--root", type=Path, default="data/open", help="(default: %(default)s)")
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     try:
-        fetch(root)
+        fetch(parser.parse_args(arguments).root)
     except (SdfhubError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -17,22 +17,14 @@ class Split(NamedTuple):
 
 
 def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_most: bool = False) -> Split:
-    """Training and held-out shapes, drawn evenly over the categories.
+    """Training and held-out shapes, drawn evenly over the categories; `train` None takes all others.
 
     A seeded hash of its id orders the shapes of a category. Held-out shapes are taken from the front of
     that order and training shapes from its back, so that neither number changes the other side until
     the two meet, and a smaller `train` is a part of a larger one. Roles given by a split file hold: a
     side for which roles are given draws from those alone, the other from the shapes without a role.
-
-    Args:
-        shapes: what the source offers; the order does not matter.
-        train, held_out: numbers of shapes; None trains on all that are not held out.
-        seed: another seed, another order.
-        at_most: the numbers are upper bounds. Where there are not enough shapes, or all are trained on, no
-            more than a fifth of them is held out, but one of three.
-
-    Raises:
-        SdfhubError: fewer shapes than asked for; with `at_most`, none to train on.
+    With `at_most` the numbers are upper bounds: where there are not enough shapes, or all are trained on, no
+    more than a fifth of them is held out, but one of three.
     """
     if min(held_out, train or 0) < 0:
         raise SdfhubError(f"split: the numbers of shapes must not be negative, got {train} and {held_out}")
@@ -50,8 +42,9 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
         roles = [shape.split for shape in shapes]
         given = f" ({roles.count('train')} train and {roles.count('held_out')} held out by the split file)"
         asked = f"{'all others' if train is None else train} to train on and {held_out} to hold out"
-        there = f"{len(shapes)}{given if any(roles) else ''}"
-        raise SdfhubError(f"too few shapes: {asked} are asked for, there are {there}")
+        raise SdfhubError(
+            f"too few shapes: {asked} are asked for, there are {len(shapes)}{given if any(roles) else ''}"
+        )
     return Split(train=rest[:train], held_out=chosen)
 
 

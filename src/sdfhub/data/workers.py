@@ -1,7 +1,6 @@
 """Functions mapped over worker processes; a worker that dies costs one item, not the rest.
 
-The processes are loky's: new interpreters, not forks of a caller that has threads, and they do not run the
-caller's main script again, so that it needs no `if __name__ == "__main__"`.
+The processes are loky's: new interpreters, which do not run the caller's main script again.
 """
 
 import os
@@ -11,7 +10,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import chain
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -29,11 +29,11 @@ class Crashed:
 def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[tuple[int, Any]]:
     """(index, function(item)) of each item, in the order in which they end; `Crashed` where a worker died.
 
-    Args:
-        function: picklable; its exceptions are raised here.
-        items: picklable.
-        workers: processes, each with one thread.
+    Function and items are picklable; exceptions are raised here. A worker has one thread.
     """
+    if workers < 2:
+        yield from enumerate(map(function, items))
+        return
     left = dict(enumerate(items))
     while left:
         try:
@@ -52,63 +52,46 @@ def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[
 def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[Any]:
     """function(item) of each item, in their order, computed while the caller makes the next items.
 
-    At most two items a worker wait. Where a worker dies, what is left is computed here.
-
-    Args:
-        function, items: as for `map_in_processes`; items are taken one by one.
-        workers: processes; below 2 for none but this one.
+    At most two items a worker wait. Where a worker dies, what is left is computed here, as with fewer than
+    two workers. Otherwise as `map_in_processes`.
     """
-    if workers < 2:
-        yield from map(function, items)
-        return
-    waiting: deque[tuple[Any, Future | None]] = deque()
-    with _pool(function, workers) as pool:
-        for item in items:
-            try:
-                waiting.append((item, pool.submit(_call, item)))
-            except BrokenProcessPool:
-                waiting.append((item, None))
-            if len(waiting) > 2 * workers:
-                yield _result(function, *waiting.popleft())
-        while waiting:
-            yield _result(function, *waiting.popleft())
+    items, left, futures = iter(items), deque[Any](), deque[Future]()
+    if workers >= 2:
+        with suppress(BrokenProcessPool), _pool(function, workers) as pool:
+            for item in items:
+                left.append(item)
+                futures.append(pool.submit(_call, item))
+                if len(left) > 2 * workers:
+                    yield futures.popleft().result()
+                    left.popleft()
+            while futures:
+                yield futures.popleft().result()
+                left.popleft()
+    yield from map(function, chain(left, items))
 
 
 def _in_pool(function: Callable, items: dict[int, Any], workers: int) -> Iterator[tuple[int, Any]]:
     with _pool(function, workers) as pool:
         futures = {pool.submit(_call, item): index for index, item in items.items()}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-
-
-def _result(function: Callable, item: Any, future: Future | None) -> Any:
-    try:
-        return future.result() if future else function(item)
-    except BrokenProcessPool:
-        return function(item)
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
 
 
 @contextmanager
 def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
-    before = os.environ.get(SAFE_PATH)
+    before = os.environ.pop(SAFE_PATH, None)
     os.environ[SAFE_PATH] = "1"  # for the processes that clean up after the workers; started once
-    try:
-        resource_tracker.ensure_running()
-        env, arguments = dict.fromkeys((*THREADS, SAFE_PATH), "1"), (function, os.getpid())
-        pool = ProcessPoolExecutor(workers, env=env, initializer=_start, initargs=arguments)
-    finally:
-        if before is None:
-            del os.environ[SAFE_PATH]
-        else:
-            os.environ[SAFE_PATH] = before
+    resource_tracker.ensure_running()
+    env, arguments = dict.fromkeys((*THREADS, SAFE_PATH), "1"), (function, os.getpid())
+    pool = ProcessPoolExecutor(workers, env=env, initializer=_start, initargs=arguments)
+    del os.environ[SAFE_PATH]
+    os.environ |= {SAFE_PATH: before} if before is not None else {}
     try:
         yield pool
     finally:
         pool.shutdown(kill_workers=True)
 
 
-_function: Callable
-"""Of a worker process: handed over once, since a source with its list of files may be large."""
+_function: Callable  # of a worker process: handed over once, since a source with its files may be large
 
 
 def _call(item: Any) -> Any:

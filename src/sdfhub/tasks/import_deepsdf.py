@@ -22,7 +22,7 @@ from torch import Tensor
 from sdfhub.checkpoint_file import LAST, write_checkpoint
 from sdfhub.composition import plain
 from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shape_id
-from sdfhub.data.sources.split_file import names_listed
+from sdfhub.data.sources.source import names_listed
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import PARTS, saved_decoder

@@ -1,4 +1,4 @@
-"""Streams per-shape samples as training batches: step number in, batch out, nothing remembered.
+"""Per-shape samples as training batches: step number in, batch out, nothing remembered.
 
 A batch is a function of (seed, step), so that a resumed run sees what an uninterrupted one would, with any
 number of loader workers. Stored rows are shuffled, so a random draw is one contiguous, wrapping slice.
@@ -13,9 +13,13 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch.utils.data import Dataset
 
-from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.store.stored_shape import COLUMNS, StoredShape, draw_rows, draw_signed, refuse_empty
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
+
+# Largest number of each array: samples lie near the cube, surface points and normals in the unit ball.
+# Distances beyond it are cut, far outside of what the clamped loss tells apart.
+EXTENT = {"outside": 1.5, "inside": 1.5, "surface": 1.0}
 
 
 @dataclass(frozen=True)
@@ -30,13 +34,11 @@ class Augmentation:
     mirror: bool = True  # odd copies in the plane x = 0
     smallest: Annotated[float, Field(gt=0, le=1)] = 0.8  # scales are uniform from here to 1
 
-    def transform(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.float32]:
-        """Factors [3] of the axes and the scale of distances, for copy 0 (the shape itself) and up."""
-        if copy == 0:
-            return np.ones(3, np.float32), np.float32(1)
-        scale = np.float32(np.random.default_rng((seed, row)).uniform(self.smallest, 1))
-        flip = -1 if self.mirror and copy % 2 else 1
-        return np.array([flip, 1, 1], np.float32) * scale, scale
+    def factors(self, copy: int, row: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of samples [4] (x, y, z, sdf) and of oriented points [6], for copy 0 (the shape itself) and up."""
+        scale = np.float32(np.random.default_rng((seed, row)).uniform(self.smallest, 1) if copy else 1)
+        axes = np.array([-1 if self.mirror and copy % 2 else 1, 1, 1], np.float32) * scale
+        return np.append(axes, scale), np.append(axes, np.sign(axes))
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,7 @@ class Loading:
 
 
 class StepBatches(Dataset):
-    """Training batches by step number.
-
-    Args:
-        shapes: S prepared shapes; shape s has code row s, its copy c row s + c * S.
-        loading: what a step draws; never more shapes a step than there are rows.
-    """
+    """Training batches of S shapes by step number; shape s has code row s, its copy c row s + c * S."""
 
     def __init__(self, shapes: Sequence[StoredShape], loading: Loading):
         self.shapes, self.loading = shapes, loading
@@ -71,10 +68,9 @@ class StepBatches(Dataset):
     def share(self, rank: int, world: int) -> None:
         """Keeps, of every batch, the part of process `rank` of `world`."""
         if self.shapes_per_step % world:
-            raise SdfhubError(
-                f"data.loader.shapes_per_step={self.shapes_per_step} cannot be shared by {world} processes; "
-                f"choose a multiple of {world}, at most {self.rows}"
-            )
+            setting = f"data.loader.shapes_per_step={self.shapes_per_step}"
+            advice = f"choose a multiple of {world}, at most {self.rows}"
+            raise SdfhubError(f"{setting} cannot be shared by {world} processes; {advice}")
         self.rank, self.world = rank, world
 
     def __len__(self) -> int:
@@ -91,9 +87,9 @@ class StepBatches(Dataset):
             draw_signed(points, self.shapes[index], rng)
             draw_rows(oriented, self.shapes[index], "surface", rng)
             if copy:
-                axes, scale = loading.augmentation.transform(copy, int(row), loading.seed)
-                points *= np.append(axes, scale)
-                oriented *= np.concatenate([axes, np.sign(axes)])
+                of_samples, of_surface = loading.augmentation.factors(copy, int(row), loading.seed)
+                points *= of_samples
+                oriented *= of_surface
         return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
 
     def rows_of(self, step: int) -> np.ndarray:
@@ -109,33 +105,64 @@ class StepBatches(Dataset):
         return np.random.default_rng((self.loading.seed, 2, step, row))
 
 
+class ResidentBatches(StepBatches):
+    """The same batches from samples that all lie on one device: a step copies nothing but where it starts.
+
+    Numbers are kept as 16-bit fractions of EXTENT: half the memory, and with an error of 2e-5 ten times
+    closer than 16-bit floats. A thousand shapes of 500,000 samples take 4.4 GB. Plain twin: `StepBatches`.
+    """
+
+    def __init__(self, shapes: Sequence[StoredShape], loading: Loading, device: torch.device):
+        super().__init__(shapes, loading)
+        self.device, inside = device, loading.samples_per_shape // 2
+        self.wanted = {"outside": loading.samples_per_shape - inside, "inside": inside}
+        self.wanted["surface"] = loading.surface_per_shape
+        for shape in shapes:
+            for name, count in self.wanted.items():
+                refuse_empty(shape, name, count)
+        self.counts = {name: np.array([shape.rows(name) for shape in shapes]) for name in EXTENT}
+        self.first = {name: np.cumsum([0, *counts]) for name, counts in self.counts.items()}
+        self.tables = {name: self._table(name) for name in EXTENT}
+
+    def _table(self, name: str) -> torch.Tensor:
+        """[R, C] int16, the rows of all shapes, one after the other."""
+        first = self.first[name]
+        table = torch.empty((int(first[-1]), COLUMNS[name]), dtype=torch.int16, device=self.device)
+        for index, shape in enumerate(self.shapes):
+            array = torch.from_numpy(shape.read(name, 0, shape.rows(name)))
+            if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
+                what = f"has points up to {reach:.3g} from 0 along an axis"
+                raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
+            fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
+            table[first[index] : first[index + 1]] = fractions.to(self.device)
+        return table
+
+    def __getitem__(self, step: int) -> Batch:
+        rows, loading = self.rows_of(step), self.loading
+        copies, shapes = np.divmod(rows, len(self.shapes))
+        starts = np.zeros((3, len(rows)), np.int64)
+        for column, (row, shape) in enumerate(zip(rows, shapes, strict=True)):
+            rng = self.generator(step, row)
+            for line, name in enumerate(EXTENT):
+                starts[line, column] = rng.integers(self.counts[name][shape]) if self.wanted[name] else 0
+        outside, inside, surface = map(self._gathered, EXTENT, [shapes] * 3, starts)
+        samples = torch.cat([outside, inside], dim=1)
+        if loading.augmentation.copies:
+            factors = map(loading.augmentation.factors, copies, rows.tolist(), [loading.seed] * len(rows))
+            of_samples, of_surface = (self._moved(np.stack(part)) for part in zip(*factors, strict=True))
+            samples, surface = samples * of_samples[:, None], surface * of_surface[:, None]
+        return batch_of(self._moved(rows), samples, surface)
+
+    def _moved(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+    def _gathered(self, name: str, shapes: np.ndarray, start: np.ndarray) -> torch.Tensor:
+        """[B, n, C] consecutive rows, wrapping within each shape, as float32."""
+        first, rows, begin = map(self._moved, (self.first[name][shapes], self.counts[name][shapes], start))
+        steps = begin[:, None] + torch.arange(self.wanted[name], device=self.device)
+        return self.tables[name][first[:, None] + steps % rows[:, None].clamp(min=1)] * (EXTENT[name] / 32767)
+
+
 def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
     """A batch from its rows [B], samples [B, N, 4] and oriented surface points [B, M, 6]."""
     return Batch(rows, samples[..., :3], samples[..., 3], surface[..., :3], surface[..., 3:])
-
-
-def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
-    """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
-    rows = np.empty((count, 4), np.float32)
-    draw_signed(rows, shape, rng)
-    return rows
-
-
-def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> None:
-    """Fills rows [N, 4], contiguous, with what `signed_samples` returns."""
-    outside = len(rows) - len(rows) // 2
-    draw_rows(rows[:outside], shape, "outside", rng)
-    draw_rows(rows[outside:], shape, "inside", rng)
-
-
-def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
-    """Fills rows [n, C], contiguous, with consecutive ones of a shuffled array from a random start."""
-    refuse_empty(shape, name, len(rows))
-    if len(rows):
-        shape.read_into(rows, name, int(rng.integers(shape.rows(name))))
-
-
-def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
-    """Raises SdfhubError where rows are to be drawn of an array that has none."""
-    if count and not shape.rows(name):
-        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")

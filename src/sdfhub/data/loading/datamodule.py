@@ -11,8 +11,7 @@ import torch
 from pydantic import NonNegativeInt, PositiveInt
 from torch.utils.data import DataLoader, Sampler
 
-from sdfhub.data.loading.batches import Loading, StepBatches
-from sdfhub.data.loading.resident import ResidentBatches
+from sdfhub.data.loading.batches import Loading, ResidentBatches, StepBatches
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
 from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
@@ -79,19 +78,18 @@ class SdfDataModule(L.LightningDataModule):
         self.preparation, self.loader, self.validation_shapes = preparation, loader, validation_shapes
         self.train_shapes: list[StoredShape] = []
         self.held_out_shapes: list[StoredShape] = []
-        self._batches: StepBatches | None = None
 
     @cached_property
     def split(self) -> Split:
         """The source's shapes by role; none is prepared for it."""
         offered = self.source.shapes()
         roles = split(offered, self.shapes, self.held_out, self.split_seed, self.source.is_collection)
-        train, held_out = len(roles.train), len(roles.held_out)
+        train, held_out = map(len, roles)
         left_out = len(offered) - train - held_out
         if self.source.is_collection and (left_out or (train, held_out) != (self.shapes, self.held_out)):
             asked = f"data.shapes={'null' if self.shapes is None else self.shapes}"
             log.info(
-                f"data: {self.source.label}: of {_counted(len(offered))} {train} are trained on, {held_out} "
+                f"data: {self.source.label}: of {len(offered)} shapes {train} are trained on, {held_out} "
                 f"held out, {left_out} left out ({asked} and data.held_out={self.held_out} are upper bounds)"
             )
         return roles
@@ -100,9 +98,7 @@ class SdfDataModule(L.LightningDataModule):
         """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
         store = self.filled(roles)
         train, held_out = ([store[s.id] for s in part if s.id in store] for part in roles)
-        asked = _counted(len(roles.train + roles.held_out))
-        rejected = f" ({asked} asked for, {len(store.rejected)} rejected)" if store.rejected else ""
-        what = f"{_counted(len(train))} to train on, {len(held_out)} held out{rejected}"
+        what = f"{len(train)} shapes to train on, {len(held_out)} held out, {len(store.rejected)} rejected"
         log.info(f"data: {self.source.name}: {what}")
         log.info(f"store: {store.folder}: {store.summary()}")
         return train, held_out
@@ -115,60 +111,49 @@ class SdfDataModule(L.LightningDataModule):
     def prepare_part(self, part: int, parts: int) -> tuple[int, int]:
         """Prepares part 1 <= `part` <= `parts` of the shapes; returns its shapes, and those prepared now."""
         own = (self.split.train + self.split.held_out)[part - 1 :: parts]
-        return len(own), stores.prepare_part(
-            self.source, own, self.preparation, Path(self.store), self.workers
-        )
+        made = stores.prepare_part(self.source, own, self.preparation, Path(self.store), self.workers)
+        return len(own), made
 
     def prepare_data(self) -> None:
-        """Fills the store; a second call does nothing.
-
-        Raises:
-            SdfhubError: too few shapes, no usable one, or normals are asked of a source that has none.
-        """
+        """Fills the store; a second call does nothing."""
         self.setup()
 
     def setup(self, stage: str | None = None) -> None:
         """Opens the store, filled as `prepare_data` does; a second call does nothing."""
-        if self._batches is not None:
+        if self.train_shapes:
             return
         if self.loader.surface_per_shape and not self.source.has_normals:
-            name = self.source.name
-            raise SdfhubError(f"normals=on: the files of data={name} carry none; train with normals=off")
+            what = f"the files of data={self.source.name} carry none; train with normals=off"
+            raise SdfhubError(f"normals=on: {what}")
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
         if not self.train_shapes:
             raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")
-        self._batches = StepBatches(self.train_shapes, self.loader)
 
-    @property
+    @cached_property
     def batches(self) -> StepBatches:
         """Training batches by step, after `setup`."""
-        if self._batches is None:
+        if not self.train_shapes:
             raise SdfhubError("SdfDataModule: call prepare_data() and setup() first")
-        return self._batches
+        return StepBatches(self.train_shapes, self.loader)
 
     @property
     def rows(self) -> int:
         """Rows that the code table needs: shapes and their augmented copies."""
         return self.batches.rows
 
-    @property
-    def steps_per_epoch(self) -> int:
-        """Training batches of one epoch."""
-        return len(self.batches)
-
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer
         device = trainer.strategy.root_device if trainer else torch.device("cpu")
         resident = device.type != "cpu" if self.loader.resident is None else self.loader.resident
         if resident and not isinstance(self.batches, ResidentBatches):
-            self._batches = ResidentBatches(self.train_shapes, self.loader, device)
+            self.batches = ResidentBatches(self.train_shapes, self.loader, device)
         done = None
         if trainer:
             self.batches.share(trainer.global_rank, trainer.world_size)
             done = lambda: trainer.global_step * trainer.accumulate_grad_batches  # noqa: E731
         return DataLoader(
             self.batches,
-            sampler=EpochSteps(self.steps_per_epoch, done),
+            sampler=EpochSteps(len(self.batches), done),
             batch_size=None,
             num_workers=0 if resident else self.loader.workers,
             persistent_workers=False,  # a worker of the last epoch would not hear of the next
@@ -180,7 +165,3 @@ class SdfDataModule(L.LightningDataModule):
         items = [ValidationShape("held_out", None, shape) for shape in self.held_out_shapes[:count]]
         items += [ValidationShape("train", row, s) for row, s in enumerate(self.train_shapes[:count])]
         return DataLoader(items, batch_size=None)  # type: ignore[arg-type]
-
-
-def _counted(shapes: int) -> str:
-    return f"{shapes} shape" + "s" * (shapes != 1)

@@ -4,19 +4,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sdfhub.data.preparation.normalize import normalize_mesh
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
 from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
 from sdfhub.geometry.surface_sampling import sample_surface
-from sdfhub.shapes import NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
+from sdfhub.triangles import face_normals, piece_count
 
 if TYPE_CHECKING:
     import trimesh
 
 PROBES = 2000  # samples on which the fast path must agree with the winding number
+ZERO_AREA = 1e-15  # of a line, normalised units squared: rounding may leave so much
 
 
 def prepare_mesh(
@@ -52,27 +53,23 @@ def prepare_mesh(
         method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
         signed = _signed_samples(surface, method, preparation, rng)
     points, sdf, statistics = signed
-    certain, inside = statistics["certain"], statistics["inside"]
-    low, high = preparation.min_inside, preparation.max_inside
-    if certain < preparation.min_certain:
-        what = f"{certain:.1%} certain, at least {preparation.min_certain:.0%} wanted"
-        raise RejectedMesh("ambiguous_signs", what)
-    if not low <= inside <= high:
-        raise RejectedMesh("inside_fraction", f"{inside:.2%} inside, {low:.1%} to {high:.0%} wanted")
-    surface_points, normals = np.zeros((0, 3)), np.zeros((0, 3))
+    _refuse_doubtful(statistics["certain"], statistics["inside"], preparation)
+    oriented = np.zeros((2, 0, 3))
     if count := preparation.surface_points:
-        surface_points, normals = sample_surface(surface.vertices, surface.solid(), count, rng)
-        order = rng.permutation(count)
-        surface_points, normals = surface_points[order], normals[order]
-    return ShapeSamples(
-        points.astype(np.float32),
-        sdf.astype(np.float32),
-        surface_points.astype(np.float32),
-        normals.astype(np.float32),
-        normalized.frame,
-        NormalizedMesh(surface.vertices, surface.faces, normalized.frame),
-        statistics,
-    )
+        found = np.stack(sample_surface(surface.vertices, surface.solid(), count, rng))
+        oriented = found[:, rng.permutation(count)]
+    points, sdf, on_surface, normals = (array.astype(np.float32) for array in (points, sdf, *oriented))
+    sampled = NormalizedMesh(surface.vertices, surface.faces, normalized.frame)
+    return ShapeSamples(points, sdf, on_surface, normals, normalized.frame, sampled, statistics)
+
+
+def _refuse_doubtful(certain: float, inside: float, limits: Preparation) -> None:
+    if certain < limits.min_certain:
+        what = f"{certain:.1%} certain, at least {limits.min_certain:.0%} wanted"
+        raise RejectedMesh("ambiguous_signs", what)
+    if not limits.min_inside <= inside <= limits.max_inside:
+        what = f"{inside:.2%} inside, {limits.min_inside:.1%} to {limits.max_inside:.0%} wanted"
+        raise RejectedMesh("inside_fraction", what)
 
 
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:
@@ -110,3 +107,72 @@ def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: 
     probes, sdf = points[order], sdf[order]
     inside = SIGN_METHODS["winding"](probes, nearest_points(probes, surface), surface, rng).inside
     return bool(np.mean(inside != (sdf < 0)) < 0.002)
+
+
+def normalize_mesh(
+    vertices: np.ndarray, faces: np.ndarray, preparation: Preparation = DEFAULT
+) -> NormalizedMesh:
+    """The mesh in the normalised frame, equal vertices merged, empty and repeated triangles gone.
+
+    Vertices [V, 3] are merged in the normalised frame, where a tolerance means the same for every mesh, be
+    its scale 1e20 or 1e-12. Triangles [F, 3] with the same three corners count once, whichever way they turn.
+    """
+    vertices, faces = _checked_arrays(vertices, faces)
+    if len(faces) < preparation.min_faces:
+        raise RejectedMesh("too_few_faces", f"{len(faces)} faces, at least {preparation.min_faces} wanted")
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices = vertices[used]
+    half = vertices.max(axis=0) / 2 - vertices.min(axis=0) / 2  # halves first: a sum may overflow
+    ratio, wanted = half.min() / max(half.max(), np.finfo(np.float64).tiny), preparation.min_extent_ratio
+    if not half.max() > 0 or ratio < wanted:
+        raise RejectedMesh("flat", f"smallest over largest extent {ratio:.2g}, at least {wanted} wanted")
+    try:
+        frame, vertices = Frame.around(vertices)
+    except ValueError as error:
+        what = f"largest extent {2 * half.max():.2g} cannot be normalised"
+        raise RejectedMesh("extent_out_of_range", what) from error
+    vertices, faces = _merged(vertices, faces.reshape(-1, 3))
+    filled = np.linalg.norm(face_normals(vertices, faces), axis=1) > 2 * ZERO_AREA
+    if (empty := 1 - filled.mean()) > preparation.max_zero_area:
+        what = f"{empty:.1%} of the faces, at most {preparation.max_zero_area:.0%} wanted"
+        raise RejectedMesh("zero_area_faces", what)
+    faces = _without_repeats(faces[filled], len(vertices))
+    if (count := piece_count(faces, len(vertices))) > preparation.max_components:
+        what = f"{count} pieces, at most {preparation.max_components} wanted"
+        raise RejectedMesh("too_many_components", what)
+    return NormalizedMesh(vertices, faces, frame)
+
+
+def _checked_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        vertices, faces = np.asarray(vertices), np.asarray(faces)
+    except ValueError as error:  # rows of different lengths
+        raise RejectedMesh("malformed_arrays", str(error)) from error
+    if faces.size == 0 or vertices.size == 0:
+        raise RejectedMesh("no_faces", f"{len(vertices)} vertices and {len(faces)} faces")
+    for name, array, kinds in (("vertices", vertices, "fiu"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            what = f"{name}: expected [N, 3] numbers, got {list(array.shape)} {array.dtype}"
+            raise RejectedMesh("malformed_arrays", what)
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        what = f"{faces.min()} to {faces.max()}, with {len(vertices)} vertices"
+        raise RejectedMesh("face_index_out_of_range", what)
+    if bad := int((~np.isfinite(vertices)).any(axis=1).sum()):
+        raise RejectedMesh("non_finite_vertices", f"{bad} of {len(vertices)} vertices are not finite")
+    return vertices, faces
+
+
+def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that share a cell of width 1e-6 become the first of them."""
+    cells = np.floor((vertices + 1) * 2**20 + 0.5).astype(np.int64)  # 21 bits an axis: one 63-bit key
+    keys = cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
+    _, first, row = np.unique(keys, return_index=True, return_inverse=True)
+    return vertices[first], row[faces]
+
+
+def _without_repeats(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """The first of all faces with the same three corners, sorted by their corners."""
+    low, middle, high = np.sort(faces, axis=1).T
+    pair = np.unique(low * vertex_count + middle, return_inverse=True)[1]  # numbers, faster than rows
+    return faces[np.unique(pair * vertex_count + high, return_index=True)[1]]

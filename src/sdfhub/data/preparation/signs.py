@@ -1,7 +1,6 @@
 """Inside or outside: rival methods with one signature, and the exact distance for all of them.
 
-libigl's own signed distance by fast winding number returns wrong magnitudes, so the sign and the distance
-are computed apart and combined by the caller.
+libigl's own signed distance by fast winding number returns wrong magnitudes: sign and distance stand apart.
 """
 
 from collections.abc import Callable
@@ -39,8 +38,8 @@ class Signs(NamedTuple):
     certain: np.ndarray  # [N] far enough from a tie
 
 
+# takes points [N, 3], their nearest points of the surface, the surface and a source of chance
 SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs]
-"""Takes points [N, 3], their nearest points of the surface, the surface and a source of chance."""
 
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
@@ -55,11 +54,9 @@ def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
 def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator) -> Signs:
     """Inside where the generalised winding number of the solid faces is above 1/2.
 
-    Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds.
-
-    No face crosses the ball around a point whose radius is its distance. The number is computed for the
-    centres of such balls only, from large cells to small ones, and handed to the other points of the ball
-    when it is clearly a whole one (near a hole it is not).
+    Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds. No face crosses the ball around a
+    point whose radius is its distance: the number is computed for the centres of such balls only, from large
+    cells to small ones, and handed to the other points of the ball when it is clearly a whole one.
     """
     order = morton_order(points)
     points, distance = points[order], nearest.distance[order]
@@ -136,8 +133,7 @@ def pseudo_normal_signs(
         part = np.einsum("nj,nj->n", np.cross(b - a, foot - a), normals[nearest.face])
         share = np.minimum(share, part / np.sum(normals**2, axis=1)[nearest.face])
     inside = np.einsum("nj,nj->n", points - foot, normals[nearest.face]) < 0
-    edge = share < 1e-6  # elsewhere the face's own normal decides, at no further cost
-    if edge.any():
+    if (edge := share < 1e-6).any():  # elsewhere the face's own normal decides, at no further cost
         kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
         inside[edge] = igl.signed_distance(points[edge], surface.vertices, surface.faces, kind)[0] < 0
     return Signs(inside, np.ones(len(points), bool))
@@ -146,12 +142,8 @@ def pseudo_normal_signs(
 def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
     """Triangles halved across their longest edge until none is longer than `longest`, or ROOM is used up.
 
-    Trees over triangles prune by boxes, and fast winding numbers sum up compact groups: the long thin
-    triangles of a chair's legs make both visit nearly all triangles.
-
-    Returns:
-        vertices [V + M, 3], faces [F + M, 3] that turn as the given ones do, and of each of these the row
-        [F + M] of the face it is a piece of.
+    The long thin triangles of a chair's legs make trees of boxes, and fast winding numbers, visit nearly all.
+    Returns vertices [V + M, 3], faces [F + M, 3], and the rows [F + M] of the faces that these are pieces of.
     """
     source, left = np.arange(len(faces)), np.arange(len(faces))
     room = ROOM
@@ -173,8 +165,5 @@ def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[n
     return vertices, faces, source
 
 
-SIGN_METHODS: dict[str, SignMethod] = {
-    "winding": winding_signs,
-    "vote": vote_signs,
-    "pseudo_normal": pseudo_normal_signs,
-}
+SIGN_METHODS: dict[str, SignMethod]
+SIGN_METHODS = {"winding": winding_signs, "vote": vote_signs, "pseudo_normal": pseudo_normal_signs}

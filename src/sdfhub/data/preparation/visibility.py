@@ -5,7 +5,6 @@ seen from both sides are sheets without an inside.
 """
 
 import os
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import igl
@@ -15,8 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.errors import RejectedMesh
-from sdfhub.geometry.sphere import sphere_directions
-from sdfhub.geometry.surface_sampling import points_on_faces
+from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
@@ -35,8 +33,7 @@ SOLID = 0.8  # winding number above which the space behind a face counts as soli
 TOUCH = 5e-6  # above a face: where a ray to the eye starts, so that a coincident face does not stop it
 
 
-@dataclass(frozen=True)
-class Surface:
+class Surface(NamedTuple):
     """The faces that bound a shape, oriented outwards, normalised frame."""
 
     vertices: np.ndarray  # [V, 3] float64
@@ -49,78 +46,59 @@ class Surface:
         return self.faces[~self.two_sided]
 
 
-class Sightings(NamedTuple):
-    """How much of the faces is seen, as a share of what isolated ones would be from all around."""
+def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> np.ndarray:
+    """[2, F] share of each face's counter-clockwise and other side that parallel views from all around see.
 
-    front: np.ndarray  # [F] of the counter-clockwise side; an unoccluded one reaches about 0.5
-    back: np.ndarray  # [F]
-
-
-def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> Sightings:
-    """The share of each face's two sides that parallel views from all around see.
-
-    Rays are aimed at points on the faces: a small one is then judged by as many as it needs. A first round
-    looks at every face, large ones more often; a second at those seen too little, or from either side.
+    An isolated face reaches about 0.5 on its outer side. Rays are aimed at points on the faces: a small one
+    is then judged by as many as it needs. A first round looks at every face, large ones more often; a second
+    at those seen too little, or from either side.
     """
-    observer = _Observer(mesh, rng.permutation(sphere_directions(views)), rng)
-    large = (observer.area / observer.area.sum() * LARGE).astype(np.int64)
-    observer.look(np.arange(len(large)), large + _rays_per_face(len(large), FIRST))
-    front, back, cast = observer.sums
-    undecided = np.flatnonzero((front + back < SURE * cast) | (np.minimum(front, back) > 0))
-    if len(undecided):
-        observer.look(undecided, AGAIN * large[undecided] + _rays_per_face(len(undecided), SECOND))
-    return Sightings(*(observer.sums[:2] / np.maximum(observer.sums[2], 1e-12)))
+    directions = rng.permutation(sphere_directions(views)).astype(np.float32)
+    corners, normals = mesh.vertices.astype(np.float32)[mesh.faces], face_normals(mesh.vertices, mesh.faces)
+    area = np.linalg.norm(normals, axis=1)
+    normals = (normals / area[:, None]).astype(np.float32)
+    turn = rng.integers(len(directions), size=len(area))  # a face takes one direction after the other
+    front, back, cast = sums = np.zeros((3, len(area)))  # weighted by the cosine
+    scene = EmbreeScene()
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
 
+    def look(
+        faces: np.ndarray, rays: np.ndarray
+    ) -> None:  # [S] rows, and the number of rays for each of them
+        starts = np.cumsum(rays) - rays
+        row = np.repeat(turn[faces] - starts, rays) + np.arange(rays.sum())
+        direction = directions[row % len(directions)]
+        origins = points_on_faces(corners, np.repeat(faces, rays), rng) + np.float32(TOUCH) * direction
+        cosine = np.einsum("nj,nj->n", np.repeat(normals[faces], rays, axis=0), direction)
+        seen = np.where(scene.run(origins, direction, query="OCCLUDED") < 0, cosine, 0)
+        for total, weight in zip(
+            sums, (np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine)), strict=True
+        ):
+            total[faces] += np.add.reduceat(weight, starts)
+        turn[faces] += rays
 
-def _rays_per_face(faces: int, most: int) -> int:
-    return int(np.clip(RAYS // faces, most // 2, most))
-
-
-class _Observer:
-    """Casts rays towards `directions` [D, 3] at the faces of one mesh, and sums up the sightings."""
-
-    def __init__(self, mesh: NormalizedMesh, directions: np.ndarray, rng: np.random.Generator):
-        self.directions, self.rng = directions.astype(np.float32), rng
-        self.corners = mesh.vertices.astype(np.float32)[mesh.faces]
-        normals = face_normals(mesh.vertices, mesh.faces)
-        self.area = np.linalg.norm(normals, axis=1)
-        self.normals = (normals / self.area[:, None]).astype(np.float32)
-        self.next = rng.integers(len(directions), size=len(mesh.faces))  # a face takes one after the other
-        self.sums = np.zeros((3, len(mesh.faces)))  # weighted by the cosine: front, back, cast
-        self.scene = EmbreeScene()
-        TriangleMesh(self.scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-
-    def look(self, faces: np.ndarray, rays: np.ndarray) -> None:
-        """Casts `rays` [S] rays, at least one, at each of `faces` [S]."""
+    def look_in_chunks(faces: np.ndarray, rays: np.ndarray, most: int) -> None:
+        rays = rays + int(np.clip(RAYS // len(faces), most // 2, most))
         ends = np.cumsum(rays)
         bounds = np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK))
         for chunk in np.split(np.arange(len(faces)), np.unique(bounds)):
             if len(chunk):
-                self._look(faces[chunk], rays[chunk])
-        self.next[faces] += rays
+                look(faces[chunk], rays[chunk])
 
-    def _look(self, faces: np.ndarray, rays: np.ndarray) -> None:
-        starts = np.cumsum(rays) - rays
-        turn = np.repeat(self.next[faces] - starts, rays) + np.arange(rays.sum())
-        direction = self.directions[turn % len(self.directions)]
-        origins = points_on_faces(self.corners, np.repeat(faces, rays), self.rng)
-        origins += np.float32(TOUCH) * direction
-        cosine = np.einsum("nj,nj->n", np.repeat(self.normals[faces], rays, axis=0), direction)
-        seen = np.where(self.scene.run(origins, direction, query="OCCLUDED") < 0, cosine, 0)
-        for row, weight in enumerate((np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine))):
-            self.sums[row, faces] += np.add.reduceat(weight, starts)
+    large = (area / area.sum() * LARGE).astype(np.int64)
+    look_in_chunks(np.arange(len(area)), large, FIRST)
+    undecided = np.flatnonzero((front + back < SURE * cast) | (np.minimum(front, back) > 0))
+    if len(undecided):
+        look_in_chunks(undecided, AGAIN * large[undecided], SECOND)
+    return sums[:2] / np.maximum(cast, 1e-12)
 
 
 def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.random.Generator) -> Surface:
     """The faces that are seen, each turned to the side that is seen most, sheets marked.
 
     Source: DeepSDF (Park et al. 2019), section 5: oriented points from what 100 virtual cameras see.
-
     DeepSDF's two gates hold for the vote alone, in which each sighting speaks for itself: a mesh that lacks
     2% of its faces fails them, while the winding number closes such holes and judges its own certainty.
-
-    Raises:
-        RejectedMesh: too much of it are sheets, or too many sightings contradict each other.
     """
     front, back = sightings(mesh, preparation.views, rng)
     total, wrong, is_turned = front + back, np.minimum(front, back), back > front
@@ -130,9 +108,7 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
     two_sided = kept & (wrong > preparation.two_sided_above * total)
     two_sided[two_sided] = ~_bounds_a_solid(mesh.vertices, faces[kept], faces[two_sided])
     if not (kept & ~two_sided).any():
-        raise RejectedMesh(
-            "two_sided_area", "no visible face has a single visible side: nothing has an inside"
-        )
+        raise RejectedMesh("two_sided_area", "no visible face has a single visible side")
     visible = np.where(kept, area, 0)
     statistics = {
         "hidden_area": float(area[~kept].sum() / area.sum()),
@@ -141,9 +117,8 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
         "contradictory": float((visible * wrong).sum() / (visible * total).sum()),
         "bad_faces": float((visible * (wrong > BAD * total)).sum() / visible.sum()),
     }
-    for name in ("two_sided_area", *(("contradictory", "bad_faces") if preparation.sign == "vote" else ())):
-        limit = getattr(preparation, f"max_{name}")
-        if statistics[name] > limit:
+    for name in ("two_sided_area", "contradictory", "bad_faces")[: 3 if preparation.sign == "vote" else 1]:
+        if statistics[name] > (limit := getattr(preparation, f"max_{name}")):
             raise RejectedMesh(name, f"{statistics[name]:.1%}, at most {limit:.0%} wanted")
     return Surface(mesh.vertices, np.ascontiguousarray(faces[kept]), two_sided[kept], statistics)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sdfhub.data.sources.folder import SourceOfFiles
 from sdfhub.data.sources.source import Shape, folder_safe, unique_ids
-from sdfhub.data.sources.split_file import SourceOfFiles
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import NORMALIZED, Frame, ShapeSamples
 
@@ -69,13 +69,7 @@ def by_synset(categories: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
-    """The id of the shape whose samples lie at a path such as `ShapeNetV2/03001627/1a2b` below a root.
-
-    Args:
-        path: without suffix.
-        category_of: category of each synset.
-        above: name of the root.
-    """
+    """The id of the samples at a path such as `ShapeNetV2/03001627/1a2b` below a root called `above`."""
     *parents, stem = path.split("/")
     folder = "_".join(part for part in parents if part != _SAMPLES) or "folder"
     category = category_of.get(parents[-1] if parents else above, folder)
@@ -83,31 +77,25 @@ def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
 
 
 def read_samples(path: Path) -> ShapeSamples:
-    """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does.
-
-    Raises:
-        RejectedMesh: corrupt_file; one_sided_samples where nothing lies outside or nothing inside;
-            wrong_frame where points lie beyond REACH.
-    """
+    """The samples in one of DeepSDF's .npz files; rows with a NaN are dropped, as DeepSDF does."""
     parts = []
     for name in ("pos", "neg"):
         rows = npz_array(path, name)
         if rows.ndim != 2 or rows.shape[1] != 4:
-            what = f"{path}: {name} has the shape {list(rows.shape)}, not [n, 4]"
-            raise RejectedMesh("corrupt_file", what)
+            raise RejectedMesh("corrupt_file", f"{path}: {name} is {list(rows.shape)}, not [n, 4]")
         rows = rows.astype(np.float32)
         parts.append(rows[np.isfinite(rows).all(axis=1)])
-    outside, inside = parts
-    if not len(outside) or not len(inside):
-        what = f"{path}: {len(outside)} samples outside, {len(inside)} inside"
-        raise RejectedMesh("one_sided_samples", what)
-    rows = np.concatenate([outside, inside])
+    outside, inside = map(len, parts)
+    if not outside or not inside:
+        raise RejectedMesh("one_sided_samples", f"{path}: {outside} samples outside, {inside} inside")
+    rows = np.concatenate(parts)
     if (reach := np.abs(rows[:, :3]).max()) > REACH:
         what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
         raise RejectedMesh("wrong_frame", what)
-    none = np.zeros((0, 3), dtype=np.float32)
-    frame, statistics = frame_of(path) or NORMALIZED, {"inside": len(inside) / len(rows)}
-    return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, statistics)
+    none, frame = np.zeros((0, 3), dtype=np.float32), frame_of(path) or NORMALIZED
+    return ShapeSamples(
+        rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, {"inside": inside / len(rows)}
+    )
 
 
 def frame_of(path: Path) -> Frame | None:
@@ -133,19 +121,15 @@ def npz_array(path: Path, name: str) -> np.ndarray:
     """One floating-point array of an .npz, its size checked before anything is allocated."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
-            if np.lib.format.read_magic(file) != (
-                1,
-                0,
-            ):  # headers of others may claim gigabytes for themselves
+            if np.lib.format.read_magic(file) != (1, 0):  # other headers may claim gigabytes for themselves
                 raise ValueError(f"{name} is not in numpy's format 1.0")
             shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
             size = math.prod(shape) * dtype.itemsize
             if dtype.kind != "f" or min(shape, default=0) < 0 or size > MAX_BYTES:
                 raise ValueError(f"{name} is {list(shape)} {dtype}, not some floating-point numbers")
-            content = file.read(size)
+            array = np.frombuffer(file.read(size), dtype, math.prod(shape))
             if file.read(1):  # at its end the archive's checksum is compared
                 raise ValueError(f"{name} is longer than its header says")
-            array = np.frombuffer(content, dtype, math.prod(shape))
             return array.reshape(shape, order="F" if is_fortran else "C")
     except (MemoryError, RecursionError):
         raise

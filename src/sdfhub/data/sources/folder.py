@@ -1,19 +1,65 @@
-"""Any folder of mesh files."""
+"""Folders of mesh files: any folder, and ShapeNet's."""
 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+import re
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
+from pydantic import BaseModel, StringConstraints
+
+from sdfhub.data.sources import source as sources
 from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path, read_mesh
-from sdfhub.data.sources.source import Shape, folder_safe, unique_ids
-from sdfhub.data.sources.split_file import SourceOfFiles
+from sdfhub.data.sources.source import Shape, Source, folder_safe
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Mesh
+from sdfhub.shapes import Mesh, ShapeSamples
 from sdfhub.whole_file import file_sha256
+
+LAYOUTS = ("models/model_normalized.obj", "model.obj")  # of a ShapeNet model's mesh: version 2, version 1
+
+
+class SourceOfFiles(Source):
+    """A source of one file per shape below a root, named for `kind` and its root.
+
+    Args:
+        root: the folder that holds the files.
+        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
+            either is given, unlisted shapes are left out. None lets a seed decide.
+    """
+
+    def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
+        self.root = Path(os.path.abspath(root))
+        self.train_split = train_split and os.path.abspath(train_split)
+        self.test_split = test_split and os.path.abspath(test_split)
+        place = self.root.resolve()
+        self.name = f"{kind}-{folder_safe(place.name)}-{sources.digits(place)}"
+        self._files: dict[str, Path] = {}
+
+    @abstractmethod
+    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
+        """Each shape by id with its file, and its path below the root as split files have it."""
+
+    def read(self, file: Path) -> Mesh | ShapeSamples:
+        """What a shape's file holds."""
+        return read_mesh(file)
+
+    def shapes(self) -> list[Shape]:
+        if not self.root.is_dir():
+            what = "a file, not a folder" if self.root.exists() else "no such folder"
+            raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
+        listed = list(self.listed())
+        self._files = {shape.id: file for shape, file, _ in listed}
+        paths = [(shape, path) for shape, _, path in listed]
+        return sources.with_roles(paths, self.train_split, self.test_split)
+
+    def load(self, shape: Shape) -> Mesh | ShapeSamples:
+        if not self._files:
+            self.shapes()
+        return self.read(self._files[shape.id])
 
 
 class FolderSource(SourceOfFiles):
@@ -48,13 +94,13 @@ class FolderSource(SourceOfFiles):
         return folder_safe(self.root.resolve().name)
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
-        below = {path: path.relative_to(self.root) for path in sorted(self.root.rglob("*"))}
+        below = {path: path.relative_to(self.root).with_suffix("") for path in self.root.rglob("*")}
         ids = {
             path: _id(part)
             for path, part in below.items()
-            if part.suffix.lower() in FORMATS
-            and not any(name.startswith(".") for name in part.parts)
+            if path.suffix.lower() in FORMATS
             and path.is_file()
+            and not re.search(r"(^|/)\.", part.as_posix())
         }
         if not ids:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")
@@ -62,20 +108,16 @@ class FolderSource(SourceOfFiles):
         if missing := [name for name in self.categories if name not in there]:
             what = f"data.source.root={self.root} has no folder of that name, but {', '.join(there)}"
             raise SdfhubError(f"category={missing[0]}: {what}; without category= all are taken")
-        for id, file in sorted(unique_ids(ids, self.root).items()):
+        for id, file in sorted(sources.unique_ids(ids, self.root).items()):
             category = id.partition("/")[0]
-            if not self.categories or category in self.categories:
+            if category in (self.categories or there):
                 # a name may hold bytes of another encoding, which JSON would not take
-                title = os.fsencode(file.name).decode(errors="replace")
-                shape = Shape(id, category, _fingerprint(file), credits={"title": title})
-                yield shape, file, below[file].with_suffix("").as_posix()
-
-    def read(self, file: Path) -> Mesh:
-        return read_mesh(file)
+                credits = {"title": os.fsencode(file.name).decode(errors="replace")}
+                yield Shape(id, category, _fingerprint(file), credits=credits), file, below[file].as_posix()
 
 
 def _id(path: Path) -> str:
-    category, *rest = path.with_suffix("").parts if len(path.parts) > 1 else ("folder", path.stem)
+    category, *rest = path.parts if len(path.parts) > 1 else ("folder", path.name)
     return f"{folder_safe(category)}/{folder_safe('_'.join(rest))}"
 
 
@@ -83,10 +125,50 @@ def _fingerprint(file: Path) -> str:
     """Hash of a file's content, and of the buffers that a .gltf names."""
     digest = file_sha256(file)
     if file.suffix.lower() == ".gltf":
-        with suppress(
-            ValueError, AttributeError, TypeError, RecursionError
-        ):  # reading will say what is wrong
+        with suppress(ValueError, AttributeError, TypeError, RecursionError):  # reading says what is wrong
             buffers = [buffer_path(file.parent, name) for name in buffer_names(json.loads(file.read_bytes()))]
             parts = [digest, *(file_sha256(buffer) for buffer in buffers if buffer)]
             digest = hashlib.sha256("".join(parts).encode()).hexdigest()
     return digest
+
+
+class Category(BaseModel):
+    """A category's settings: ShapeNet's number of it, a quoted string of digits."""
+
+    synset: Annotated[str, StringConstraints(pattern=r"^\d+$")]
+
+
+class ShapeNetSource(SourceOfFiles):
+    """ShapeNetCore as it unpacks: models `<root>/<synset>/<model>/`, their meshes as in version 1 or 2.
+
+    A model is known by its file's size and date, not its content: hashing ShapeNet at every start takes
+    minutes.
+
+    Args:
+        categories: name -> {synset}.
+        root: the folder that holds the synsets' folders.
+        train_split, test_split: see `SourceOfFiles`.
+    """
+
+    def __init__(
+        self,
+        categories: Mapping[str, Any],
+        root: str,
+        train_split: str | None = None,
+        test_split: str | None = None,
+    ):
+        super().__init__("shapenet", root, train_split, test_split)
+        self.categories = sorted(sources.checked_categories(categories, Category).items())
+
+    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
+        for category, settings in self.categories:
+            folder = self.root / settings.synset
+            places = [model / layout for model in sorted(folder.glob("*")) for layout in LAYOUTS]
+            files = {file.relative_to(folder).parts[0]: file for file in reversed(places) if file.is_file()}
+            if not files:
+                raise SdfhubError(f"{folder}: holds no <model>/{LAYOUTS[0]} or <model>/{LAYOUTS[1]}")
+            for model, file in sorted(files.items()):
+                credits = {"author": "ShapeNet", "licence": "ShapeNet terms of use", "title": model}
+                id, state = f"{category}/{folder_safe(model)}", file.stat()
+                shape = Shape(id, category, f"{state.st_size} {state.st_mtime_ns}", credits=credits)
+                yield shape, file, f"{settings.synset}/{model}"

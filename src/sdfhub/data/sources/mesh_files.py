@@ -16,15 +16,15 @@ FORMATS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".ac")
 MAX_BYTES = 1 << 30  # of a file: text formats take some ten times their size in memory
 MAX_VERTICES = 50_000_000  # of a glTF's scene: a small file may draw one mesh many times
 
+_OFF_COUNTS = re.compile(rb"(?:\s|#[^\n]*\n)*OFF(?:\s|#[^\n]*\n)+(\d+)\s+(\d+)(?:[ \t]+\d+)?")
 _BAD_NUMBER = re.compile(rb"^[ \t]*v[ \t][^\n#]*\b(nan|inf)", re.IGNORECASE | re.MULTILINE)
 
 
 def read_mesh(path: str | Path) -> Mesh:
     """The mesh in a file, in the file's frame and units: parts of a scene in place, polygons as triangles.
 
-    Raises:
-        SdfhubError: the file is missing, too large or of no known format.
-        RejectedMesh: empty_file, corrupt_file, no_faces or non_finite_vertices; the detail names the file.
+    Raises SdfhubError for a file that is missing, too large or of no known format, and RejectedMesh
+    (empty_file, corrupt_file, no_faces, non_finite_vertices, ...) with the file's name.
     """
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
@@ -37,12 +37,9 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = None) -> Mesh:
-    """The triangles of a whole mesh file's content; see `read_mesh`.
+    """The triangles of the whole content of a mesh file, called `name` in messages; see `read_mesh`.
 
-    Args:
-        content, suffix: of the file; one of FORMATS.
-        name: of the file in messages.
-        folder: where a .gltf finds its buffers; None forbids other files.
+    A .gltf finds its buffers in `folder`; None forbids other files.
     """
     if not content.strip():
         raise RejectedMesh("empty_file", f"{name} holds nothing")
@@ -80,14 +77,19 @@ def check_length(content: bytes, suffix: str) -> None:
         promised = 84 + 50 * int.from_bytes(content[80:84], "little")
     elif suffix == ".ply" and b"\nformat ascii" in content[:1000]:
         head, _, body = content.partition(b"end_header")
-        promised = sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE)))
-        held = _lines(body)
-    elif suffix == ".off":
-        counts = re.match(rb"(?:\s|#[^\n]*\n)*OFF(?:\s|#[^\n]*\n)+(\d+)\s+(\d+)(?:[ \t]+\d+)?", content)
-        promised = sum(map(int, counts.groups())) if counts else 0
-        held = _lines(content[counts.end() :]) if counts else 0
+        promised, held = (
+            sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE))),
+            _lines(body),
+        )
+    elif suffix == ".off" and (counts := _OFF_COUNTS.match(content)):
+        promised, held = sum(map(int, counts.groups())), _lines(content[counts.end() :])
     if promised > held:
         raise RejectedMesh("corrupt_file", f"ends too early: its header promises {promised}, it holds {held}")
+
+
+def _lines(body: bytes) -> int:
+    """Number of lines that are not blank."""
+    return sum(1 for line in body.splitlines() if line.strip())
 
 
 def _gltf_buffers(content: bytes, suffix: str, folder: Path | None) -> dict[str, bytes]:
@@ -99,25 +101,21 @@ def _gltf_buffers(content: bytes, suffix: str, folder: Path | None) -> dict[str,
         content, folder = content[20 : 20 + int.from_bytes(content[12:16], "little")], None
     scene = json.loads(content)
     meshes, accessors = scene.get("meshes", []), scene.get("accessors", [])
+    parts = [part for mesh in meshes for part in mesh["primitives"]]
     names = {*scene.get("extensionsRequired", []), *scene.get("extensions", {})}
-    names = names.union(*(part.get("extensions", {}) for mesh in meshes for part in mesh["primitives"]))
+    names = names.union(*(part.get("extensions", {}) for part in parts))
     if packed := sorted(name for name in names if "compression" in name):
         raise RejectedMesh("compressed", f"needs {', '.join(packed)}; export it without compression")
     if any("bufferView" not in accessor and "sparse" not in accessor for accessor in accessors):
         raise RejectedMesh("corrupt_file", "claims numbers that it does not hold")
-    counts = [
-        sum(accessors[part["attributes"]["POSITION"]]["count"] for part in mesh["primitives"])
-        for mesh in meshes
-    ]
+    counts = [sum(accessors[p["attributes"]["POSITION"]]["count"] for p in m["primitives"]) for m in meshes]
     drawn = sum(counts[node["mesh"]] for node in scene.get("nodes", []) if "mesh" in node)
     if drawn > MAX_VERTICES:
         raise RejectedMesh("too_large", f"draws {drawn:,} vertices, at most {MAX_VERTICES:,} are read")
-    buffers = {}
-    for name in buffer_names(scene):
-        if not (path := buffer_path(folder, name)):
-            raise RejectedMesh("corrupt_file", f"its buffer {name!r} does not lie beside it")
-        buffers[name] = path.read_bytes()
-    return buffers
+    paths = {name: buffer_path(folder, name) for name in buffer_names(scene)}
+    if missing := [name for name, path in paths.items() if not path]:
+        raise RejectedMesh("corrupt_file", f"its buffer {missing[0]!r} does not lie beside it")
+    return {name: path.read_bytes() for name, path in paths.items() if path}
 
 
 def buffer_names(scene: dict) -> list[str]:
@@ -136,11 +134,6 @@ def buffer_path(folder: Path | None, name: str) -> Path | None:
     paths = [(folder / spelling).resolve() for spelling in (name, unquote(name))]
     paths = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
     return paths[0] if paths and paths[0].stat().st_size <= MAX_BYTES else None
-
-
-def _lines(body: bytes) -> int:
-    """Number of lines that are not blank."""
-    return sum(1 for line in body.splitlines() if line.strip())
 
 
 def _by_trimesh(content: bytes, suffix: str, buffers: dict[str, bytes]) -> Mesh:

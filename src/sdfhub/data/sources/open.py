@@ -24,6 +24,7 @@ from sdfhub.whole_file import write_whole
 MEASURES = ".measured.json"  # a cache: faces, size and hash of the models seen so far, by file and date
 CATALOGUE = "PluginFurnitureCatalog.properties"
 MAX_CATALOGUE, MAX_MODEL = 16 << 20, 256 << 20  # bytes unpacked: a small archive may claim any size
+NOTHING = re.compile("(?!)")  # is found nowhere
 AIRCRAFT_CREDITS = {"author": "the FlightGear team", "licence": "GPL-2+"}
 
 
@@ -59,14 +60,12 @@ class _Model:
     min_faces: int = 1
 
     def content(self) -> bytes:
-        if self.member:
-            return read_model(self.file, self.member)
-        if self.file.stat().st_size > MAX_BYTES:
-            raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft")
-        return self.file.read_bytes()
+        return read_model(self.file, self.member) if self.member else self.file.read_bytes()
 
     def triangles(self) -> Mesh:
         name = self.member or self.file.name
+        if self.file.stat().st_size > MAX_BYTES:
+            raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft or library")
         return triangles_of(self.content(), Path(name).suffix.lower(), f"{self.file.name}: {name}")
 
     def measured(self) -> dict[str, Any]:
@@ -75,9 +74,8 @@ class _Model:
             vertices, faces = self.triangles()
         except RejectedMesh:
             return {"faces": 0}
-        extents = np.ptp(vertices[faces.ravel()], axis=0)
         area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
-        twin = " ".join(f"{value:.4g}" for value in (*extents, area))
+        twin = " ".join(f"{value:.4g}" for value in (*np.ptp(vertices[faces.ravel()], axis=0), area))
         return {"faces": len(faces), "twin": twin, "sha256": hashlib.sha256(self.content()).hexdigest()}
 
 
@@ -136,29 +134,23 @@ class OpenSource(Source):
 
     def _candidates(self) -> Iterator[_Model]:
         for category, rules in sorted(self.rules.items()):
-            if rules.catalogue:
-                include, exclude = rules.catalogue.include, rules.catalogue.exclude
+            if rule := rules.catalogue:
                 for archive in sorted(self.root.rglob("*.sh3f")):
                     for member, credits in furniture_in(archive):
                         title = credits["title"].lower()
-                        if include.search(title) and not (exclude and exclude.search(title)):
+                        if rule.include.search(title) and not (rule.exclude or NOTHING).search(title):
                             yield _Model(category, archive, member, credits)
-            if rules.aircraft:
-                exclude = rules.aircraft.exclude
+            if aircraft := rules.aircraft:
                 for file in sorted(self.root.rglob("AI/Aircraft/**/*.ac")):
                     below = file.as_posix().rpartition("AI/Aircraft/")[2]
-                    if not (exclude and exclude.search(below.lower())):
+                    if not (aircraft.exclude or NOTHING).search(below.lower()):
                         title = f"{below.partition('/')[0]} {file.stem}"
                         credits = AIRCRAFT_CREDITS | {"title": title}
-                        yield _Model(category, file, "", credits, rules.aircraft.min_faces)
+                        yield _Model(category, file, "", credits, aircraft.min_faces)
 
 
 def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Of a library's OBJ models, in the catalogue's order: name in the archive; author, licence and title.
-
-    Raises:
-        SdfhubError: not a zip archive with a catalogue.
-    """
+    """Of a library's OBJ models, in the catalogue's order: name in the archive; author, licence and title."""
     try:
         with zipfile.ZipFile(archive) as library:
             entries = parse_properties(_content(library, CATALOGUE, MAX_CATALOGUE).decode("latin-1"))
@@ -175,11 +167,7 @@ def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def read_model(archive: Path, member: str) -> bytes:
-    """The content of a model within its library.
-
-    Raises:
-        RejectedMesh: corrupt_file; the archive is damaged there, or the model larger than MAX_MODEL.
-    """
+    """The content of a model within its library, of at most MAX_MODEL bytes."""
     try:
         with zipfile.ZipFile(archive) as library:
             return _content(library, member, MAX_MODEL)
@@ -192,13 +180,9 @@ def read_model(archive: Path, member: str) -> bytes:
 def parse_properties(text: str) -> dict[str, str]:
     r"""Keys and values of a Java properties file: comments, `\` at a line's end, and `\uXXXX` are known."""
     joined = re.sub(r"\\\r?\n[ \t]*", "", text)
+    joined = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), joined)
     pairs = re.findall(r"^[ \t]*([^#!\s=:][^\s=:]*)[ \t]*[=:][ \t]*(.*?)[ \t\r]*$", joined, re.MULTILINE)
-    return {key: _unescaped(value) for key, value in pairs}
-
-
-def _unescaped(value: str) -> str:
-    letters = re.sub(r"\\u([0-9a-fA-F]{4})", lambda match: chr(int(match[1], 16)), value)
-    return re.sub(r"\\(.)", r"\1", letters).strip()
+    return {key: re.sub(r"\\(.)", r"\1", value).strip() for key, value in pairs}
 
 
 def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:

@@ -1,12 +1,15 @@
 """What every data source offers: a list of shapes, and the mesh or the samples of one of them."""
 
 import hashlib
+import json
+import logging
 import os
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -14,6 +17,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples, check_id
+
+log = logging.getLogger(__name__)
 
 Role = Literal["train", "held_out"]
 Settings = TypeVar("Settings")
@@ -48,19 +53,11 @@ class Source(ABC):
 
     @abstractmethod
     def shapes(self) -> list[Shape]:
-        """All shapes on offer, sorted by id, the same in every process.
-
-        Raises:
-            SdfhubError: the source's root is not there or holds no shape.
-        """
+        """All shapes on offer, sorted by id, the same in every process; SdfhubError where there is none."""
 
     @abstractmethod
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
-        """The mesh of one shape in its source's frame, or its samples where the source holds no mesh.
-
-        Raises:
-            RejectedMesh: the file holds no usable mesh.
-        """
+        """The mesh of one shape in its source's frame, or its samples; RejectedMesh where there is none."""
 
 
 def checked_categories(categories: Any, settings: type[Settings]) -> dict[str, Settings]:
@@ -75,19 +72,84 @@ def checked_categories(categories: Any, settings: type[Settings]) -> dict[str, S
 
 def folder_safe(text: str) -> str:
     """`text` with everything that a shape's id may not hold replaced by `_`."""
-    safe = re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).lstrip("._+-")
-    return safe[:100] or "unnamed"
+    return re.sub(r"[^A-Za-z0-9_.+-]+", "_", text).lstrip("._+-")[:100] or "unnamed"
 
 
 def unique_ids(wanted: Mapping[Path, str], root: Path | None = None) -> dict[str, Path]:
     """Path of each id; paths that want the same id get some digits of their hash, below `root`, behind it."""
-    uses = Counter(wanted.values())
-    below = {path: path.relative_to(root) if root else path for path in wanted}
-    return {
-        id if uses[id] == 1 else f"{id}-{digits(below[path])}": path for path, id in sorted(wanted.items())
-    }
+    uses, unique = Counter(wanted.values()), {}
+    for path, id in sorted(wanted.items()):
+        unique[id if uses[id] == 1 else f"{id}-{digits(path.relative_to(root or ''))}"] = path
+    return unique
 
 
 def digits(path: Path) -> str:
     """6 hex digits that tell paths apart."""
     return hashlib.sha256(os.fsencode(path.as_posix())).hexdigest()[:6]
+
+
+def with_roles(
+    shapes: list[tuple[Shape, str]], train_split: str | None, test_split: str | None
+) -> list[Shape]:
+    """The shapes that split files list, with their roles; all of them, without roles, where no file is given.
+
+    A split file is JSON in one of three forms: DeepSDF's `{"ShapeNetV2": {"03001627": ["id", ...]}}`, a list
+    of names, or `{"train": [names], "held_out": [names]}` (or `test`), which may be given for both sides. A
+    name is the path of a file below the root, as beside each shape, or its last parts, without suffix.
+    """
+    if not train_split and not test_split:
+        return [shape for shape, _ in shapes]
+    role_of: dict[str, Role] = {}
+    files: dict[Role, str | None] = {"train": train_split, "held_out": test_split}
+    for role, file in files.items():
+        listed = _ids_listed(shapes, file, role) if file else set()
+        if both := sorted(listed & role_of.keys()):
+            raise SdfhubError(f"{file}: {both[0]} is in the training split as well")
+        role_of |= dict.fromkeys(listed, role)
+    return [replace(shape, split=role_of[shape.id]) for shape, _ in shapes if shape.id in role_of]
+
+
+def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: Role) -> set[str]:
+    names, of_path, of_ending = sorted(set(names_listed(file, role))), defaultdict(list), defaultdict(list)
+    for shape, path in shapes:
+        of_path[path].append(shape.id)
+        for ending in _endings(path):
+            of_ending[ending].append(shape.id)
+    ids = {}  # a name that is a path means that file alone; others are the last parts of one, or end in one
+    for name in names:
+        longer, shorter = of_ending.get(name, []), (of_path.get(end, []) for end in _endings(name))
+        ids[name] = of_path.get(name) or [*longer, *chain.from_iterable(shorter)]
+    listed = set(chain.from_iterable(ids.values()))
+    if not listed:
+        raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
+    if lost := [name for name in names if not ids[name]]:
+        what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
+        log.warning(f"{file}: {what}, such as {lost[0]}")
+    return listed
+
+
+def names_listed(file: str, role: Role) -> Iterator[str]:
+    """The names that a split file lists for a role, in its order; nested keys become parts of a path."""
+    try:
+        content = json.loads(Path(file).read_text())
+    except (OSError, ValueError) as error:
+        raise SdfhubError(f"{file}: not JSON that can be read: {error}") from error
+    if isinstance(content, dict) and content and content.keys() <= {"train", "held_out", "test"}:
+        content = content.get(role, content.get("test", []) if role == "held_out" else [])
+    yield from _flattened(content, "", file)
+
+
+def _flattened(content: object, prefix: str, file: str) -> Iterator[str]:
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _flattened(value, f"{prefix}{key}/", file)
+    elif isinstance(content, list) and all(isinstance(name, str) for name in content):
+        yield from (prefix + name for name in content)
+    else:
+        forms = '{"dataset": {"class": [ids]}}, [names] or {"train": [names], "test": [names]}'
+        raise SdfhubError(f"{file}: expected {forms}")
+
+
+def _endings(path: str) -> Iterable[str]:
+    parts = path.split("/")
+    return ("/".join(parts[start:]) for start in range(len(parts)))

@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -44,12 +44,7 @@ TRIED_AGAIN = ("error", "crash")  # reasons that lie in the machine or the progr
 
 
 class Store(dict[str, StoredShape]):
-    """Prepared shapes of one source under one preparation by id, in the order asked for.
-
-    Args:
-        folder: of the store.
-        shapes: those wanted of it; the rejected ones are listed in `rejected` alone.
-    """
+    """The usable ones of the `shapes` asked for by id, in their order; the others are in `rejected` alone."""
 
     def __init__(self, folder: Path, shapes: Iterable[StoredShape]):
         shapes = list(shapes)
@@ -60,8 +55,7 @@ class Store(dict[str, StoredShape]):
     @classmethod
     def open(cls, folder: Path, up: Literal["y", "z"] = "z") -> "Store":
         """All shapes whose files lie in `folder`; raises SdfhubError where there are none."""
-        files = (Path(path, name) for path, _, names in os.walk(folder) for name in names)
-        paths = (file.relative_to(folder).as_posix() for file in files if file.name.endswith(SUFFIX))
+        paths = (file.relative_to(folder).as_posix() for file in folder.rglob(f"*{SUFFIX}"))
         ids = sorted(id for path in paths if re.fullmatch(SHAPE_ID, id := path.removesuffix(SUFFIX)))
         if not ids:
             raise SdfhubError(f"{folder}: holds no prepared shapes; run `sdfhub prepare` first")
@@ -75,11 +69,10 @@ class Store(dict[str, StoredShape]):
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
         kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
-        lines = [f"{kept}; preparing took {seconds:.2f} s a shape"]
-        for reason, count in Counter(record.reason for record in self.rejected.values()).most_common():
-            id, detail = next((id, r.detail) for id, r in self.rejected.items() if r.reason == reason)
-            lines.append(f"  rejected {count} x {reason}, such as {id} ({detail})")
-        return "\n".join(lines)
+        such = {record.reason: f"{id} ({record.detail})" for id, record in self.rejected.items()}
+        counts = Counter(record.reason for record in self.rejected.values()).most_common()
+        rejected = "".join(f"\n  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts)
+        return f"{kept}; preparing took {seconds:.2f} s a shape{rejected}"
 
 
 def prepare(
@@ -89,34 +82,19 @@ def prepare(
 
     A shape is prepared again when its fingerprint, the preparation or VERSION changes, or its file is
     damaged. Its randomness derives from its id and fingerprint, so neither the order nor the number of
-    workers matters.
-
-    Args:
-        source: picklable; loads the shapes.
-        shapes: what is wanted.
-        preparation: the settings, part of the store's folder name.
-        root: folder of all stores.
-        workers: processes; None takes one per core, 1 works in this process.
-
-    Raises:
-        SdfhubError: not one shape could be prepared, or the store cannot be written.
+    workers (None: one per core; 1: none but this process) matters. `root` is the folder of all stores.
     """
     folder = root / source.name / preparation_hash(preparation)
-    stored = _checked(folder, shapes, source, preparation, quiet=True)
+    stored = _checked(folder, shapes, source, preparation, logging.DEBUG)
     if _left(shapes, stored):
         waiting = f"store: {folder}: waiting for another process that prepares it"
         with _writing(folder), locked(folder / ".lock", waiting=waiting):
             _remove_leftovers(folder)
-            # another process may have filled it meanwhile
-            left = _left(shapes, _checked(folder, shapes, source, preparation))
-            for shape, is_crash in _prepared(source, left, preparation, folder, workers):
-                if is_crash:
-                    what = "the worker process died: out of memory, or a fault in a native library"
-                    write_shape(_file(folder, shape.id), {}, _record(shape, "crash", what))
+            prepare_part(source, shapes, preparation, root, workers)
         stored = _checked(folder, shapes, source, preparation)
     store = Store(folder, (stored[shape.id] for shape in shapes))
     if shapes and not len(store):
-        what = "; ".join(line.strip() for line in store.summary().splitlines())
+        what = store.summary().replace("\n  ", "; ")
         raise SdfhubError(f"none of the {len(shapes)} shapes of data={source.name} is usable: {what}")
     return store
 
@@ -124,15 +102,19 @@ def prepare(
 def prepare_part(
     source: Source, shapes: list[Shape], preparation: Preparation, root: Path, workers: int | None = None
 ) -> int:
-    """Prepares some of a store's shapes, as `prepare` does; several machines may do so side by side.
-
-    Returns:
-        How many were prepared or rejected; those whose worker died are left to the next call.
-    """
+    """Prepares those of `shapes` that the store lacks, also beside other machines; returns their number."""
     folder = root / source.name / preparation_hash(preparation)
     with _writing(folder):
         left = _left(shapes, _checked(folder, shapes, source, preparation))
-        return sum(not is_crash for _, is_crash in _prepared(source, left, preparation, folder, workers))
+        workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
+        results = map_in_processes(partial(prepare_shape, source, preparation, folder), left, workers)
+        # disable=None: no bar where nobody watches
+        bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
+        for index, result in bar:
+            if isinstance(result, Crashed):
+                what = "the worker process died: out of memory, or a fault in a native library"
+                write_shape(_file(folder, left[index].id), {}, _record(left[index], what, reason="crash"))
+    return len(left)
 
 
 def preparation_hash(preparation: Preparation) -> str:
@@ -155,40 +137,25 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
         loaded = source.load(shape)
         samples = loaded if isinstance(loaded, ShapeSamples) else prepare_mesh(loaded, preparation, seed)
         arrays = arrays_of(samples, seed)
-        x, y, z = samples.center.tolist()
-        statistics = {name: float(value) for name, value in samples.statistics.items()}
-        record = replace(
-            _record(shape, None), center=(x, y, z), scale=float(samples.scale), statistics=statistics
-        )
+        frame, statistics = samples.frame, samples.statistics
+        record = _record(shape, center=frame.center.tolist(), scale=frame.scale, statistics=statistics)
     except RejectedMesh as rejection:
-        record = _record(shape, rejection.reason, rejection.detail)
+        record = _record(shape, rejection.detail, reason=rejection.reason)
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
-        record = _record(shape, "error", f"{type(error).__name__}: {error}")
+        record = _record(shape, f"{type(error).__name__}: {error}", reason="error")
     seconds = round(time.perf_counter() - start, 4)
     write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
 
 
-def _record(shape: Shape, reason: str | None, detail: str = "") -> Record:
+def _record(shape: Shape, detail: str = "", **known: Any) -> Record:
     detail = detail.encode(errors="replace").decode()  # a path in it may hold bytes of another encoding
-    return Record(shape.fingerprint, shape.category, shape.credits, reason=reason, detail=detail)
-
-
-def _prepared(
-    source: Source, left: list[Shape], preparation: Preparation, folder: Path, workers: int | None
-) -> Iterator[tuple[Shape, bool]]:
-    """Each shape when it is prepared, and whether its worker died on it."""
-    workers = max(1, min(workers or os.cpu_count() or 1, len(left)))
-    function = partial(prepare_shape, source, preparation, folder)
-    results = map_in_processes(function, left, workers) if workers > 1 else enumerate(map(function, left))
-    # disable=None: no bar where nobody watches
-    bar = tqdm(results, total=len(left), desc=f"preparing {source.name}", unit="shape", disable=None)
-    return ((left[index], isinstance(result, Crashed)) for index, result in bar)
+    return Record(shape.fingerprint, shape.category, shape.credits, detail=detail, **known)
 
 
 def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     """The shapes that are not in the store as they are now."""
-    fine = {id for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
-    return [s for s in shapes if s.id not in fine or stored[s.id].fingerprint != s.fingerprint]
+    final = {id: shape.fingerprint for id, shape in stored.items() if shape.record.reason not in TRIED_AGAIN}
+    return [shape for shape in shapes if final.get(shape.id) != shape.fingerprint]
 
 
 def _file(folder: Path, id: str) -> Path:
@@ -214,18 +181,14 @@ def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -
 
 
 def _checked(
-    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, quiet: bool = False
+    folder: Path, shapes: list[Shape], source: Source, preparation: Preparation, level: int = logging.WARNING
 ) -> dict[str, StoredShape]:
-    """The stored shapes whose files are intact, by id; damage is logged.
-
-    The index notes which files are intact, and for a reader what the store was made of.
-    """
-    level = logging.DEBUG if quiet else logging.WARNING
+    """The stored shapes whose files are intact, by id; the index notes which these are."""
     stored = _read(folder, [shape.id for shape in shapes], source.up, level)
     try:
         known = json.loads((folder / INDEX).read_text(encoding="utf-8"))["checked"]
         changed = {id: shape for id, shape in stored.items() if known.get(id) != shape.state}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except Exception:  # it is not there, or holds anything
         known, changed = {}, dict(stored)
     with ThreadPoolExecutor() as pool:  # hashing lets other threads run
         intact = dict(zip(changed, pool.map(StoredShape.is_intact, changed.values()), strict=True))
@@ -242,10 +205,9 @@ def _checked(
 
 def _remove_leftovers(folder: Path) -> None:
     """Removes the half-written files of runs that were killed more than an hour ago."""
-    for path, _, names in os.walk(folder):
-        for leftover in (Path(path, name) for name in names if re.fullmatch(r"\..+\.[0-9a-f]{12}", name)):
-            if time.time() - leftover.lstat().st_mtime > 3600:
-                leftover.unlink(missing_ok=True)
+    for file in folder.rglob(".*"):
+        if re.fullmatch(r"\..+\.[0-9a-f]{12}", file.name) and time.time() - file.lstat().st_mtime > 3600:
+            file.unlink(missing_ok=True)
 
 
 @contextmanager

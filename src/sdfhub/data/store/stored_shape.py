@@ -7,17 +7,19 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import field
 from io import BufferedReader
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import ConfigDict, PositiveFloat, TypeAdapter
+from pydantic import ConfigDict, PositiveFloat
+from pydantic.dataclasses import dataclass
 
 from sdfhub.errors import SdfhubError
-from sdfhub.shapes import Frame, InFrame, NormalizedMesh, ShapeSamples
+from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
 from sdfhub.whole_file import whole_file
 
 SUFFIX = ".safetensors"
@@ -30,11 +32,9 @@ _SAFETENSORS_NAMES = {"<f8": "F64", "<f4": "F32", "<i4": "I32"}
 _MAX_HEADER = 1 << 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(allow_inf_nan=False))
 class Record:
     """What is known of a prepared or rejected shape."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
     fingerprint: str  # this and the next two as the source gave them
     category: str
@@ -48,16 +48,13 @@ class Record:
     sha256: str = ""  # of all else in the file
 
 
-_RECORD: TypeAdapter[Record] = TypeAdapter(Record)
-
-
 def arrays_of(samples: ShapeSamples, seed: int) -> dict[str, np.ndarray]:
     """The arrays kept of one shape; sample rows are shuffled, so that any slice is a random draw."""
     rng, inside = np.random.default_rng(seed), samples.sdf < 0
     rows = np.column_stack([samples.points, samples.sdf])
-    arrays = {"outside": rng.permutation(rows[~inside]), "inside": rng.permutation(rows[inside])}
     surface = np.column_stack([samples.surface_points, samples.surface_normals])
-    arrays["surface"] = rng.permutation(surface)
+    arrays = {"outside": rows[~inside], "inside": rows[inside], "surface": surface}
+    arrays = {name: rng.permutation(array) for name, array in arrays.items()}
     if samples.mesh is not None:
         arrays |= {"vertices": samples.mesh.vertices, "faces": samples.mesh.faces}
     return {name: np.ascontiguousarray(array, dtype=DTYPES[name]) for name, array in arrays.items()}
@@ -71,8 +68,7 @@ def write_shape(path: Path, arrays: Mapping[str, np.ndarray], record: Record) ->
     for array in arrays.values():
         digest.update(array.data)
     record = dataclasses.replace(record, sha256=digest.hexdigest())
-    metadata = {"__metadata__": {"record": json.dumps(dataclasses.asdict(record))}}
-    text = json.dumps(metadata | header).encode()
+    text = json.dumps({"__metadata__": {"record": json.dumps(dataclasses.asdict(record))}} | header).encode()
     text += b" " * (-len(text) % 8)
     with whole_file(path) as file:
         file.write(len(text).to_bytes(8, "little") + text)
@@ -96,53 +92,38 @@ def _digest(record: Record, header: Mapping[str, dict]) -> "hashlib._Hash":
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode())
 
 
-class StoredShape(InFrame):
+class StoredShape:
     """One prepared shape; its arrays are mapped when asked for, not read, and `read_into` opens no map.
 
     Training draws by `read_into`: a map costs 0.2 ms to open, and the pages touched through maps that stay
-    open would count as this process's memory until they were the whole store.
-
-    Args:
-        id: as the source gave it.
-        path: of its file; links are not followed.
-        up: the axis that points up in the source's frame, for pictures.
-
-    Attributes:
-        record: all that is known of the shape; `record.reason` is set where it was rejected.
-        state: changes when the file is written anew.
-
-    Raises:
-        OSError: the file cannot be opened.
-        ValueError: its header is damaged, or it is shorter or longer than the header says.
+    open would count as this process's memory until they were the whole store. `up` is the axis that points up
+    in the source's frame; `state` changes when the file is written anew. A file that cannot be opened raises
+    OSError, one with a damaged header or of another length ValueError.
     """
 
     def __init__(self, id: str, path: Path, up: Literal["y", "z"] = "z"):
         self.id, self.path, self.up = id, path, up
-        with self._open() as file:
+        with open(path, "rb", opener=_without_links) as file:
             status = os.fstat(file.fileno())
             length = int.from_bytes(file.read(8), "little")
-            if length > min(status.st_size, _MAX_HEADER):
-                raise ValueError("its header is damaged")
-            text = file.read(length)
+            text = file.read(length) if length <= _MAX_HEADER else b""
         try:
             header = json.loads(text)
-            self.record = _RECORD.validate_json(header.pop("__metadata__")["record"])
-            self._rows: dict[str, int] = {name: entry["shape"][0] for name, entry in header.items()}
-            is_ours = header == _header(self._rows)
-            is_ours &= all(type(rows) is int and rows >= 0 for rows in self._rows.values())
-        except (LookupError, TypeError, AttributeError, RecursionError, ArithmeticError) as error:
+            self.record = Record(**json.loads(header.pop("__metadata__")["record"]))
+            rows = {name: entry["shape"][0] for name, entry in header.items()}
+            self._header = _header(rows)
+            if header != self._header or not all(type(n) is int and n >= 0 for n in rows.values()):
+                raise ValueError("not the arrays of a shape")
+        except Exception as error:  # it may hold anything
             raise ValueError(f"its header is damaged: {error!r}") from error
-        if not is_ours:
-            raise ValueError("its header is damaged")
         self.state, self._size = f"{status.st_size} {status.st_mtime_ns}", status.st_size
         self._start = 8 + length
-        self._offsets = {name: self._start + entry["data_offsets"][0] for name, entry in header.items()}
         size = self._start + max((entry["data_offsets"][1] for entry in header.values()), default=0)
         if size != self._size:
             raise ValueError(f"it has {self._size} bytes, not {size}")
-        self.category, self.credits = self.record.category, self.record.credits
-        self.fingerprint = self.record.fingerprint
-        self.frame = Frame(np.array(self.record.center, dtype=np.float64), self.record.scale)
+        known = self.record
+        self.category, self.credits, self.fingerprint = known.category, known.credits, known.fingerprint
+        self.frame = Frame(np.array(known.center, dtype=np.float64), known.scale)
 
     @property
     def outside(self) -> np.ndarray:
@@ -162,14 +143,14 @@ class StoredShape(InFrame):
     @property
     def mesh(self) -> NormalizedMesh | None:
         """The oriented mesh behind the samples, read into memory; None where the source has none."""
-        if "faces" not in self._rows:
+        if "faces" not in self._header:
             return None
         vertices, faces = np.array(self._map("vertices")), np.array(self._map("faces"), dtype=np.int64)
         return NormalizedMesh(vertices, faces, self.frame)
 
     def rows(self, name: str) -> int:
         """Row count of an array (`outside`, `inside`, `surface`) without opening it; 0 if absent."""
-        return self._rows.get(name, 0)
+        return self._header[name]["shape"][0] if name in self._header else 0
 
     def read(self, name: str, start: int, count: int) -> np.ndarray:
         """`count` rows [count, C] of an array from row `start` on; after the last comes the first."""
@@ -182,48 +163,70 @@ class StoredShape(InFrame):
         if not len(rows):
             return
         start %= self.rows(name)
-        try:
-            with self._open() as file:
-                self._refuse_other_size(file)
-                while len(rows):
-                    part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
-                    file.seek(self._offsets[name] + start * part.strides[0])
-                    file.readinto(part.data.cast("B"))
-                    start = 0
-        except (OSError, ValueError) as error:
-            raise self._broken(error) from error
+        with self._opened() as file:
+            while len(rows):
+                part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
+                file.seek(self._offset(name) + start * part.strides[0])
+                file.readinto(part.data.cast("B"))
+                start = 0
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
         try:
-            with self._open() as file:
+            with self._opened() as file:
                 file.seek(self._start)
-                digest = hashlib.file_digest(file, lambda: _digest(self.record, _header(self._rows)))
+                digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
             return digest.hexdigest() == self.record.sha256
-        except OSError:
+        except SdfhubError:
             return False
 
-    def _open(self) -> BufferedReader:
-        return open(self.path, "rb", opener=_without_links)
+    def _offset(self, name: str) -> int:
+        return self._start + self._header[name]["data_offsets"][0]
 
     def _map(self, name: str) -> np.ndarray:
         shape = (self.rows(name), COLUMNS[name])
         if not shape[0]:  # an empty file cannot be mapped
             return np.zeros(shape, dtype=DTYPES[name])
+        with self._opened() as file:
+            return np.memmap(file, DTYPES[name], "r", self._offset(name), shape)
+
+    @contextmanager
+    def _opened(self) -> Iterator[BufferedReader]:
         try:
-            with self._open() as file:
-                self._refuse_other_size(file)
-                return np.memmap(file, DTYPES[name], "r", self._offsets[name], shape)
+            with open(self.path, "rb", opener=_without_links) as file:
+                if (size := os.fstat(file.fileno()).st_size) != self._size:
+                    raise ValueError(f"it has {size} bytes, not {self._size}")
+                yield file
         except (OSError, ValueError) as error:
-            raise self._broken(error) from error
+            why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
+            again = "start or prepare again: damaged shapes are prepared anew"
+            raise SdfhubError(f"{self.path}: {why}; {again}") from error
 
-    def _refuse_other_size(self, file: BufferedReader) -> None:
-        if (size := os.fstat(file.fileno()).st_size) != self._size:
-            raise ValueError(f"it has {size} bytes, not {self._size}")
 
-    def _broken(self, error: Exception) -> SdfhubError:
-        why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-        return SdfhubError(f"{self.path}: {why}; start or prepare again: damaged shapes are prepared anew")
+def signed_samples(shape: StoredShape, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 4] points and signed distances of a shape, half outside, half inside (the odd one outside)."""
+    return draw_signed(np.empty((count, 4), np.float32), shape, rng)
+
+
+def draw_signed(rows: np.ndarray, shape: StoredShape, rng: np.random.Generator) -> np.ndarray:
+    """Fills rows [N, 4], contiguous, with what `signed_samples` returns; gives them back."""
+    outside = len(rows) - len(rows) // 2
+    draw_rows(rows[:outside], shape, "outside", rng)
+    draw_rows(rows[outside:], shape, "inside", rng)
+    return rows
+
+
+def draw_rows(rows: np.ndarray, shape: StoredShape, name: str, rng: np.random.Generator) -> None:
+    """Fills rows [n, C], contiguous, with consecutive ones of a shuffled array from a random start."""
+    refuse_empty(shape, name, len(rows))
+    if len(rows):
+        shape.read_into(rows, name, int(rng.integers(shape.rows(name))))
+
+
+def refuse_empty(shape: StoredShape, name: str, count: int) -> None:
+    """Raises SdfhubError where rows are to be drawn of an array that has none."""
+    if count and not shape.rows(name):
+        raise SdfhubError(f"{shape.id}: holds no {name} samples; see data.preparation, or normals=off")
 
 
 def _without_links(path: str, flags: int) -> int:
