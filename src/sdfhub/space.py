@@ -224,7 +224,7 @@ class Space:
         _check_count("seed", seed, 0)
         return self.distribution.sample(n, seed)
 
-    def _tensor(self, array: Array) -> Tensor:
+    def _tensor(self, array: Array | Sequence[Any]) -> Tensor:
         try:
             plain = array if isinstance(array, Tensor) else np.array(array)  # torch takes no reversed view
             return torch.as_tensor(plain, dtype=torch.float32, device=self.device)

@@ -17,13 +17,14 @@ from sdfhub.shapes import Mesh
 
 Field = Callable[[torch.Tensor], torch.Tensor]  # points [N, 3] float32 -> signed distances [N]
 
+Device = torch.device | str
 _EMPTY = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape
 _CACHED, _LARGE = 2**13, 2**20  # points per call: what the cache of one core keeps; what fills a GPU
 
 
 def mesh_fields(
-    fields: Fields, shapes: int, resolution: int = 256, batch: int | None = None, device: Any = "cpu"
+    fields: Fields, shapes: int, resolution: int = 256, batch: int | None = None, device: Device = "cpu"
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
 
@@ -43,12 +44,12 @@ def mesh_fields(
             yield grid.to_frame(*_march_cells(own - offset, keys[held] - offset, values[held], resolution))
 
 
-def mesh_field(field: Field, resolution: int = 256, device: torch.device | str = "cpu") -> Mesh:
+def mesh_field(field: Field, resolution: int = 256, device: Device = "cpu") -> Mesh:
     """The zero level of one field, which takes points [N, 3] alone: `mesh_fields` of one shape."""
     return next(mesh_fields(_as_fields(field), 1, resolution, device=device))
 
 
-def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str = "cpu") -> Mesh:
+def mesh_dense(field: Field, resolution: int = 256, device: Device = "cpu") -> Mesh:
     """The zero level of one field, every node of the grid evaluated: the plain twin of `mesh_field`."""
     grid, nodes = _grid(_as_fields(field), range(1), resolution, None, device), resolution**3
     keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
@@ -58,7 +59,7 @@ def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str =
 
 
 def sdf_slice(
-    field: Field, axis: int = 1, offset: float = 0.0, resolution: int = 256, device: Any = "cpu"
+    field: Field, axis: int = 1, offset: float = 0.0, resolution: int = 256, device: Device = "cpu"
 ) -> np.ndarray:
     """The field [resolution, resolution] float32 on a plane across `axis`, `offset` from the origin.
 
@@ -72,7 +73,7 @@ def sdf_slice(
     return np.concatenate(parts).reshape(resolution, resolution)
 
 
-def _grid(fields: Fields, shapes: range, resolution: int, batch: int | None, device: Any) -> Grid:
+def _grid(fields: Fields, shapes: range, resolution: int, batch: int | None, device: Device) -> Grid:
     device = torch.device(device)
     batch = batch or (_CACHED * torch.get_num_threads() if device.type == "cpu" else _LARGE)
     return Grid(fields, shapes, resolution, batch, device)

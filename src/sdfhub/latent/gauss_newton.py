@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -148,7 +148,9 @@ class GaussNewtonFit:
         return Descents(shape, turn, unknowns, damping), here[0]
 
 
-def in_groups(fit: Callable[[Shapes], list[Tensor]], observations: Shapes, device: Any) -> list[Tensor]:
+def in_groups(
+    fit: Callable[[Shapes], list[Tensor]], observations: Shapes, device: torch.device
+) -> list[Tensor]:
     """What a fit finds: on a CPU one by one, so that no neighbour changes a rounding, else by size."""
     groups: dict[int, list[int]] = {}
     for row, observation in enumerate(observations):
