@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from itertools import chain, repeat
+from itertools import islice
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -42,29 +42,28 @@ def map_in_processes(function: Callable, items: Iterable, workers: int) -> Itera
         except BrokenProcessPool:  # the item that killed its worker is one of those waiting: one at a time
             for index, item in waiting.items():
                 try:
-                    yield from _in_pool(function, [(index, item)], {}, 1)
+                    yield from _in_pool(function, iter([(index, item)]), {}, 1)
                 except BrokenProcessPool:
                     yield index, Crashed()
             waiting = {}
 
 
 def _in_pool(
-    function: Callable, items: Iterable[tuple[int, Any]], waiting: dict[int, Any], workers: int
+    function: Callable, items: Iterator[tuple[int, Any]], waiting: dict[int, Any], workers: int
 ) -> Iterator[tuple[int, Any]]:
     """Results as `map_in_processes` gives them; `waiting` has the items without a result."""
     futures: dict[Future, int] = {}
     with _pool(function, workers) as pool:
-        for pair in chain(items, repeat(None)):
-            if pair:
-                waiting[pair[0]] = pair[1]
-                futures[pool.submit(_call, pair[1])] = pair[0]
-            elif not futures:
+        while True:
+            for index, item in islice(items, 2 * workers + 1 - len(futures)):
+                waiting[index] = item
+                futures[pool.submit(_call, item)] = index
+            if not futures:
                 return
-            if not pair or len(futures) > 2 * workers:
-                for future in wait(futures, return_when=FIRST_COMPLETED).done:
-                    index, result = futures.pop(future), future.result()
-                    del waiting[index]
-                    yield index, result
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                index, result = futures.pop(future), future.result()
+                del waiting[index]
+                yield index, result
 
 
 @contextmanager
