@@ -161,7 +161,7 @@ def test_furniture_libraries():
 
     def read(path: Path):
         for member, _ in furniture_in(path):
-            triangles_of(read_model(path, member), ".obj", member)
+            read_model(path, member)
 
     check_file(packed.getvalue(), read, "a.sh3f")
 
