@@ -8,7 +8,6 @@ import time
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-import safetensors.numpy
 
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.sources.source import Shape, Source
@@ -64,7 +63,7 @@ def fill(root, source, **settings) -> Store:
 
 def content(prepared: Store) -> dict[str, dict[str, bytes]]:
     """The arrays of each shape, as another reader of safetensors sees them."""
-    arrays = {shape.id: safetensors.numpy.load_file(shape.path) for shape in prepared.values()}
+    arrays = {shape.id: load_file(shape.path) for shape in prepared.values()}
     return {id: {name: array.tobytes() for name, array in found.items()} for id, found in arrays.items()}
 
 
