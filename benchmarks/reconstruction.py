@@ -41,8 +41,7 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.metrics import judge, point_to_surface
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.opening import data_of, read_run
-from sdfhub.reconstruction.reconstructor import Reconstructor
-from sdfhub.reconstruction.result import Limits, Result
+from sdfhub.reconstruction.reconstructor import Limits, Reconstructor, Result
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import Scan
 from sdfhub.scans.simulated import ScanKind

@@ -78,7 +78,7 @@ def test_plain_groups_have_the_same_settings_in_every_row_and_experiments_say_th
 
 MISTAKES = {
     "activation.beta=abc": "activation.beta='abc': should be a valid number",
-    "activation.beta=-1": "beta must be positive",
+    "activation.beta=-1": "activation.beta=-1: should be greater than 0",
     "+activation.sharpness=3": "activation.sharpness: no such setting; Hosc takes",
     "activation._target_=mypkg.Nothing": "there is no class mypkg.Nothing",
     "optim.lr_decoder=fast": "optim.lr_decoder='fast'",

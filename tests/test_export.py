@@ -13,7 +13,7 @@ from PIL import Image
 
 import sdfhub
 from sdfhub.composition import instantiate
-from sdfhub.geometry.animation import animation
+from sdfhub.geometry.picture_file import animation
 from sdfhub.tasks.export import as_function, function_file
 from tests.ball_space import FRAME, IDS, RADII, write_ball_run
 from tests.tiny import composed, run_command
@@ -143,7 +143,7 @@ def test_sampling_and_neighbours_name_the_known_shapes_nearest(run, monkeypatch,
 
 
 MISTAKES = [
-    ("interpolate", ["a=balls/smal", "b=0"], "did you mean 'balls/small'"),
+    ("interpolate", ["a=balls/smal", "b=0"], "it has balls/small"),
     ("interpolate", ["a=0"], "Missing mandatory value: b"),
     ("interpolate", ["a=0", "b=1", "steps=1"], "steps=1: must be a whole number, at least 2"),
     ("interpolate", ["a=0", "b=1", "resolution=fine"], "resolution='fine'"),

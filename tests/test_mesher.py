@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry import marching, mesher
+from sdfhub.geometry import coarse_to_fine, mesher
 from sdfhub.geometry.coarse_to_fine import SampledCells, sample_blocks
 from sdfhub.geometry.grid import Grid
 from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
@@ -86,11 +86,10 @@ class Waves(torch.nn.Module):
 
 class Counted:
     def __init__(self, field):
-        self.field, self.count, self.calls = field, 0, 0
+        self.field, self.count = field, 0
 
     def __call__(self, points):
         self.count += len(points)
-        self.calls += 1
         return self.field(points)
 
 
@@ -120,11 +119,12 @@ def assert_same_mesh(have, want):
 
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("resolution", [64, 97])
-def test_coarse_to_fine_equals_dense(name, resolution):
+def test_coarse_to_fine_equals_dense(name, resolution, monkeypatch):
+    monkeypatch.setattr(coarse_to_fine, "COARSE", 16)
     field = FIELDS[name]
     want = mesh_dense(field, resolution)
     assert len(want[0])
-    assert_same_mesh(mesh_field(field, resolution, coarse=16), want)
+    assert_same_mesh(mesh_field(field, resolution), want)
 
 
 FAMILY = [rods, lambda points: sphere(points) + 5, Waves(0), spheres_apart, torus]
@@ -156,10 +156,10 @@ def test_shapes_together_share_their_calls():
     list(mesh_fields(family, len(FAMILY), 64, batch=2**30))
     assert set(family.calls[0][1]) == set(range(len(FAMILY)))
     alone = []
-    for field in FAMILY:
-        counted = Counted(field)
-        mesh_field(counted, 64, batch=2**30)
-        alone.append(counted.calls)
+    for row in range(len(FAMILY)):
+        single = Family()
+        list(mesh_fields(lambda points, shapes, f=single, r=row: f(points, shapes + r), 1, 64, batch=2**30))
+        alone.append(len(single.calls))
     assert len(family.calls) == max(alone)
 
 
@@ -171,13 +171,6 @@ def test_memory_bounds_groups_and_calls(monkeypatch):
     assert {shape for _, shapes in family.calls for shape in shapes} == {0, 1}
     assert len(list(meshes)) == len(FAMILY) - 1
     assert max(points for points, _ in family.calls) <= 3000
-
-
-def test_slabs_join_to_the_dense_mesh(monkeypatch):
-    monkeypatch.setattr(marching, "SLAB_NODES", 10 * 40**2)
-    have = mesh_field(torus, 64)
-    assert_same_mesh(have, mesh_dense(torus, 64))
-    assert is_closed(*have)
 
 
 def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
@@ -192,8 +185,8 @@ def test_a_piece_seen_in_one_block_is_followed_to_its_end(monkeypatch):
 
 @pytest.mark.parametrize("field", [torus, Waves(0)])
 def test_signs_inferred_wrongly_are_corrected(field, monkeypatch):
-    def too_sure(grid, coarse, safety):
-        sampled = sample_blocks(grid, coarse, safety)
+    def too_sure(grid):
+        sampled = sample_blocks(grid)
         return sampled._replace(slope=0.2 * sampled.slope)
 
     monkeypatch.setattr(mesher, "sample_blocks", too_sure)

@@ -110,14 +110,14 @@ def test_point_to_surface_agrees_with_the_closed_form_of_a_cube():
 
 
 def test_iou_of_shifted_cubes():
-    assert volumetric_iou(cube(), cube(centre=(0.5, 0, 0)), 200_000) == pytest.approx(1 / 3, abs=0.005)
+    assert volumetric_iou(cube(), cube(centre=(0.5, 0, 0)), count=200_000) == pytest.approx(1 / 3, abs=0.005)
     assert volumetric_iou(cube(), cube(centre=(3, 0, 0))) == 0
 
 
 def test_a_box_turned_inside_out_within_another_is_hollow():
     vertices = np.concatenate([cube()[0], cube(0.5)[0]])
     hollow = vertices, np.concatenate([cube()[1], cube(0.5)[1][:, ::-1] + 8])
-    assert volumetric_iou(cube(), hollow, 100_000) == pytest.approx(7 / 8, abs=0.005)
+    assert volumetric_iou(cube(), hollow, count=100_000) == pytest.approx(7 / 8, abs=0.005)
     doubled = np.concatenate([cube()[0]] * 2), np.concatenate([cube()[1], cube()[1] + 8])
     assert volumetric_iou(cube(), doubled) == 1
 

@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 
+from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Finer, Gauss, Hosc, Relu, Siren, Wire
 from sdfhub.model.codes import CodeTable
 from sdfhub.model.decoder import Decoder
@@ -64,7 +65,7 @@ def test_first_layer_has_its_own_frequency():
 
 @pytest.mark.parametrize("settings", [{"omega_0": 0.0}, {"omega_hidden": -1.0}, {"beta": 0.0}])
 def test_frequencies_and_sharpness_must_be_positive(settings):
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(SdfhubError, match="Hosc.*greater than 0"):
         for first in (True, False):
             Hosc(**{"omega_0": 1.0, "omega_hidden": 1.0, "beta": 1.0} | settings, first=first)
 

@@ -16,7 +16,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.opening import begin_run
 from sdfhub.reconstruction import calibration as calibrations
 from sdfhub.reconstruction.calibration import Calibration
-from sdfhub.reconstruction.result import Limits, Result
+from sdfhub.reconstruction.reconstructor import Limits, Result
 from sdfhub.scans import simulated
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import observe

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.geometry.render import render, slice_image
 
 
@@ -55,11 +55,11 @@ def test_a_roof_darkens_what_is_under_it():
 
 def test_flat_faces_stay_flat_and_round_ones_become_smooth(ball):
     cube = trimesh.creation.box((1, 1, 1))
-    image = render(cube.vertices, cube.faces, 64, occlusion_rays=0)
+    image = render(cube.vertices, cube.faces, 64)
     assert len(np.unique(image.reshape(-1, 3), axis=0)) < 0.15 * 64 * 64  # three tones and their seams
     coarse = trimesh.creation.icosphere(subdivisions=2, radius=0.97)
-    smooth = render(coarse.vertices, coarse.faces, 64, occlusion_rays=0)[:, 32].astype(int)
-    fine = render(ball.vertices, ball.faces, 64, occlusion_rays=0)[:, 32].astype(int)
+    smooth = render(coarse.vertices, coarse.faces, 64)[:, 32].astype(int)
+    fine = render(ball.vertices, ball.faces, 64)[:, 32].astype(int)
     assert np.abs(smooth - fine)[8:56].max() < 16
 
 

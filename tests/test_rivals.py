@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from sdfhub.errors import SdfhubError
 from sdfhub.model.activations import Activation, Finer, Gauss, Siren, Wire
 from sdfhub.model.conditioning import Concat, Film, Layer
 from sdfhub.model.decoder import Decoder
@@ -134,12 +135,12 @@ class Bent(Gated):
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (partial(WrongSlope, 0.5), "WrongSlope: with_slope gives a wrong slope"),
-        (partial(ConstantSlope, 0.5), "ConstantSlope: the slope has a wrong derivative"),
+        (partial(WrongSlope, 0.5), "WrongSlope: with_slope gives a wrong derivative"),
+        (partial(ConstantSlope, 0.5), "ConstantSlope: with_slope has a wrong derivative"),
         (Normalised, "Normalised: is not elementwise"),
         (Root, "Root: value or slope at 0 is not finite"),
-        (partial(OtherFeatures, 2), "OtherFeatures: the pullback is wrong"),
-        (Unread, "Unread: the pullback is wrong"),
+        (partial(OtherFeatures, 2), "OtherFeatures: with_pullback gives a wrong derivative"),
+        (Unread, "Unread: pullback gives a wrong derivative"),
         (Bent, "Bent: the product is not linear in its inputs"),
     ],
 )
@@ -263,7 +264,7 @@ def test_a_narrow_gaussian_has_features_of_high_rank_and_steep_slopes():
     x = torch.linspace(-2, 2, 4001)
     for a in (1.0, 0.3):
         slope = Gauss(a).with_slope(x)[1].abs()
-        assert float(slope.max()) == pytest.approx(math.exp(-0.5) / a, rel=1e-4)
+        assert slope.max().item() == pytest.approx(math.exp(-0.5) / a, rel=1e-4)
         assert float(x[slope.argmax()].abs()) == pytest.approx(a, abs=2e-3)
 
 
@@ -290,7 +291,7 @@ def test_wire_is_compact_in_space_and_in_frequency():
     ],
 )
 def test_widths_and_frequencies_must_be_positive(choice, settings):
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(SdfhubError, match="greater than 0"):
         choice(**settings, first=True)
 
 

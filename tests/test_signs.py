@@ -9,8 +9,7 @@ from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.preparation.signs import ROOM, SIGN_METHODS, cut_long, nearest_points, winding_signs
 from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface
 from sdfhub.geometry.morton import morton_order
-from sdfhub.geometry.sphere import sphere_directions
-from sdfhub.geometry.surface_sampling import points_on_faces
+from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
 from sdfhub.triangles import face_normals
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 

@@ -234,7 +234,7 @@ def test_a_mesh_or_cloud_is_fitted_as_the_space_fits_it_in_its_own_frame(space, 
 
 BROKEN = {
     "a.exe": (b"MZ", "not a format"),
-    "a.ply": (b"ply\nnothing", "not a PLY file"),
+    "a.ply": (b"ply\nnothing", "cannot be read as ply"),
     "b.ply": (b"", "empty, larger than 64 MiB"),
     "c.obj": (b"v 0 0 nan\n", "nan"),
     "d.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "d.off"),

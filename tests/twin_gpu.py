@@ -19,7 +19,7 @@ from torch.utils.backend_registration import _DummyBackendModule, _setup_private
 from sdfhub.data.loading.batches import Augmentation, Loading, ResidentBatches
 from sdfhub.geometry.grid import Grid
 from sdfhub.latent.gaussian import Gaussian
-from sdfhub.latent.problem import Prior, Problem, Rows
+from sdfhub.latent.problem import Problem, Rows
 from sdfhub.latent.similarity import PoseRange
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.losses import clamped_l1
@@ -103,7 +103,7 @@ def reconstruct_scan(experiment: str) -> None:
     """The objective of a scan in a frame of its own."""
     model = model_of(experiment)
     decoder, codes = model.decoder.requires_grad_(False).eval(), model.codes.table.detach()
-    problem = Problem(decoder, [Prior(Gaussian.of(codes, 0.1), 1e-4)], 0.1, PoseRange(4, 10.0, 1.2, 0.1))
+    problem = Problem(decoder, [(Gaussian.of(codes, 0.1), 1e-4)], 0.1, PoseRange(4, 10.0, 1.2, 0.1))
     low = torch.empty(2, 8, device=GPU)
     turn = torch.zeros(2, dtype=torch.int64, device=GPU)
     rows = Rows(torch.empty(2, 8, 3, device=GPU), low, low, low > 0, low[:, 0], turn)

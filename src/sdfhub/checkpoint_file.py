@@ -10,12 +10,10 @@ import torch
 from sdfhub.errors import SdfhubError
 from sdfhub.whole_file import whole_file
 
-LAST = "last.ckpt"
-"""The newest state of a training."""
+LAST = "last.ckpt"  # the newest state of a training
 
 
 def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
-    """Writes a checkpoint whole or not at all."""
     content = io.BytesIO()
     torch.save(checkpoint, content)  # to memory: on a full disk torch does not say what is wrong
     with whole_file(path, beside=".checkpoint.part") as file:
@@ -23,13 +21,7 @@ def write_checkpoint(checkpoint: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint whose records have their checksums still, which PyTorch does not look at.
-
-    Runs no code of it.
-
-    Raises:
-        SdfhubError: no such file, a damaged one, or no checkpoint.
-    """
+    """The content of a checkpoint whose records have their checksums still; runs no code of it."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -39,11 +31,8 @@ def read_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
         with zipfile.ZipFile(io.BytesIO(content)) as records:
             if any(record.compress_type != zipfile.ZIP_STORED for record in records.infolist()):
                 raise ValueError("packed, which no training does")  # and may unpack to any size
-            if broken := records.testzip():
+            if broken := records.testzip():  # PyTorch does not look at checksums
                 raise ValueError(f"{broken} has changed since it was written")
         return torch.load(io.BytesIO(content), map_location=map_location, weights_only=True)
     except Exception as error:  # torch knows a dozen kinds of damage, and advises to read it unsafely
-        raise SdfhubError(
-            f"{path}: not a readable checkpoint: damaged or none of ours; take another that training wrote, "
-            f"such as RUN/checkpoints/{LAST}"
-        ) from error
+        raise SdfhubError(f"{path}: not a readable checkpoint: damaged or none of ours") from error

@@ -1,8 +1,8 @@
 """Objects as plain data and back: what a checkpoint, an export and a config say of a model.
 
 A description is a mapping with `_target_`, the dotted path of a class, and the arguments of its constructor,
-as in a Hydra config; `_partial_` marks a factory. `describe` writes one, `built` makes the object of one that
-comes from a file: only classes of sdfhub and of packages that the caller trusts are imported for it.
+as in a Hydra config; `_partial_` marks a factory. For one that comes from a file only classes of sdfhub and
+of packages that the caller trusts are imported.
 """
 
 import contextlib
@@ -19,15 +19,12 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 
-OF_PYTORCH = ("torch.nn.", "torch.optim.")
-"""Layers and optimisers of PyTorch are built from a file too: they do nothing but compute."""
-
-RESERVED = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
-"""Keys of a description that are no arguments."""
+OF_PYTORCH = ("torch.nn.", "torch.optim.")  # built from a file too: they do nothing but compute
+RESERVED = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")  # keys that are no arguments
 
 
 class Described:
-    """An object that remembers the arguments of its constructor, so that `describe` can write them down."""
+    """An object whose constructor's arguments are checked by their annotations, and kept for `describe`."""
 
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
@@ -40,20 +37,16 @@ def _remembering(initialise: Callable) -> Callable:
 
     @functools.wraps(initialise)
     def remember(self, *arguments: Any, **named: Any) -> None:
-        if "_arguments" not in self.__dict__:  # else the constructor of a class below this one came first
-            bound = signature.bind(self, *arguments, **named).arguments
-            self.__dict__["_arguments"] = dict(list(bound.items())[1:])
+        given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
+        check_arguments(initialise, given, type(self).__name__)
+        self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
         initialise(self, *arguments, **named)
 
     return remember
 
 
 def describe(value: Any, key: str = "") -> Any:
-    """As plain data: such data, a class, a `functools.partial`, a dataclass or a `Described`, nested.
-
-    Raises:
-        SdfhubError: an object that cannot say how it was made; names `key`.
-    """
+    """As plain data: such data, a class, a `functools.partial`, a dataclass or a `Described`, nested."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Path):
@@ -82,17 +75,8 @@ def _path(kind: Callable) -> str:
 
 
 def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "sdfhub") -> Any:
-    """The object of a description that comes from a file.
-
-    Args:
-        node: plain data; mappings with `_target_` become objects, wherever they stand.
-        key: what it is, for messages.
-        trust: packages beside sdfhub whose classes may be built.
-        within: the package of sdfhub that the others belong to.
-
-    Raises:
-        SdfhubError: a class of another package, an unknown or missing argument, a value of a wrong type.
-    """
+    """The object of a description that comes from a file: its classes are of the package `within` or of those
+    in `trust`, its arguments are checked. Mappings with `_target_` become objects, wherever they stand."""
     if isinstance(node, list):
         return [built(item, key, trust, within) for item in node]
     if not isinstance(node, Mapping):
@@ -118,23 +102,19 @@ def trusted_packages(trust: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _trusted(path: Any, key: str, trust: tuple[str, ...], within: str) -> Callable:
-    package = path.partition(".")[0] if isinstance(path, str) else ""
-    ours = (f"{within}.", *OF_PYTORCH)
-    if package not in trust and not str(path).startswith(ours):
-        hint = f"; trust={package} builds it, if you know that package" if package.isidentifier() else ""
-        raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}{hint}")
-    target = located(path, key)
-    if package not in trust and not (inspect.isclass(target) and target.__module__.startswith(ours)):
-        raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}")
-    return target
+    package, ours = str(path).partition(".")[0], (f"{within}.", *OF_PYTORCH)
+    if package in trust:
+        return located(path, key)
+    if str(path).startswith(ours):
+        target = located(path, key)
+        if inspect.isclass(target) and target.__module__.startswith(ours):
+            return target
+    hint = f"trust={package} builds it, if you know that package"
+    raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}; {hint}")
 
 
 def located(path: str, key: str) -> Callable:
-    """The class or function of a dotted path.
-
-    Raises:
-        SdfhubError: there is none; says why it cannot be imported.
-    """
+    """The class or function of a dotted path."""
     try:
         target = pkgutil.resolve_name(str(path))
         if callable(target):
@@ -146,11 +126,7 @@ def located(path: str, key: str) -> Callable:
 
 
 def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) -> None:
-    """Refuses arguments that a class or function does not take, or of another type than it annotates.
-
-    Raises:
-        SdfhubError: names the argument, its value and what is wanted.
-    """
+    """Refuses arguments that a class or function does not take, or of another type than it annotates."""
     try:
         signature = inspect.signature(target).parameters
     except (TypeError, ValueError):  # a class that is compiled
@@ -170,11 +146,7 @@ def check_arguments(target: Callable, arguments: Mapping[str, Any], key: str) ->
 
 
 def check(value: Any, hint: Any, key: str) -> Any:
-    """The value as its annotation wants it; an int where a float is due is one.
-
-    Raises:
-        SdfhubError: it is no such value.
-    """
+    """The value as its annotation wants it; an int where a float is due is one."""
     config = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
     own = hasattr(hint, "__pydantic_validator__")  # a model of pydantic has a config of its own
     try:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 import yaml
+from pydantic import TypeAdapter
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -40,9 +41,6 @@ if TYPE_CHECKING:
 FORMAT = "sdfhub space 2"
 """What an exported file says it is; another number where its content means something else."""
 
-About = dict[str, Any]
-"""Plain data of a space: description of its model, config, ids, frames, up, metrics."""
-
 
 def load(
     path: str | Path, device: str | torch.device | None = None, trust: str | Sequence[str] = ()
@@ -57,8 +55,6 @@ def load(
     Raises:
         SdfhubError: nothing usable is there, or not on this machine.
     """
-    if not isinstance(path, str | Path):
-        raise SdfhubError(f"load takes the path of a run or an exported file, got {path!r:.60}")
     path = Path(path)
     if not path.exists():
         raise SdfhubError(f"{path}: there is no such run or file")
@@ -78,22 +74,21 @@ def load(
             config=about["config"],
             metrics=about["metrics"],
         )
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OSError, RecursionError) as error:
         raise SdfhubError(f"{path}: not a shape space that this version reads: {error}") from error
 
 
 def write_space(space: Space, path: Path) -> None:
     """Writes a space as one file, whole or not at all."""
-    about: About = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
-    about |= {"frames": plain_frames(space.frames), "metrics": space.metrics}
+    about: dict[str, Any] = {"model": space.model, "config": space.config, "ids": space.ids, "up": space.up}
+    about |= {"frames": _plain_frames(space.frames), "metrics": space.metrics}
     tensors = {f"decoder.{name}": tensor for name, tensor in space.decoder.state_dict().items()}
-    tensors["codes"] = space.codes
-    tensors = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    tensors = {name: tensor.cpu().contiguous() for name, tensor in (tensors | {"codes": space.codes}).items()}
     write_whole(path, save(tensors, metadata={"format": FORMAT, "about": json.dumps(about)}))
 
 
-def plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
-    """Frames as plain numbers: centre and scale, four of them."""
+def _plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
+    """Centre and scale of frames, four numbers each."""
     return {id: [*map(float, frame.center), float(frame.scale)] for id, frame in frames.items()}
 
 
@@ -109,41 +104,28 @@ def begin_run(
     (run / "metrics.json").unlink(missing_ok=True)  # else an interrupted run would pass for a finished one
     write_whole(run / "config.yaml", yaml.safe_dump(config, sort_keys=False))
     write_whole(run / "split.json", json.dumps({"train": [*train], "held_out": [*held_out]}, indent=1))
-    write_whole(run / "frames.json", json.dumps({"up": up, "shapes": plain_frames(frames)}))
+    write_whole(run / "frames.json", json.dumps({"up": up, "shapes": _plain_frames(frames)}))
 
 
 def read_run(run: Path) -> tuple[dict[str, Any], dict[str, list[str]]]:
-    """The config and the split of a run's folder.
-
-    Raises:
-        SdfhubError: it is not a run's folder, or one of the files is broken.
-    """
+    """The config of a run's folder, and ids by role."""
     try:
         config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
-        split = json.loads((run / "split.json").read_text(encoding="utf-8"))
+        split = TypeAdapter(dict[str, list[str]]).validate_json((run / "split.json").read_bytes())
+        split = {role: split[role] for role in ("train", "held_out")}
+        return TypeAdapter(dict[str, Any]).validate_python(config), split
     except OSError as error:
         raise SdfhubError(f"run={run}: not a run's folder ({error.strerror}: {error.filename})") from error
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
-        raise SdfhubError(f"run={run}: config.yaml or split.json is broken: {error}") from error
-    are_ids = isinstance(split, dict) and all(
-        isinstance(ids, list) and all(isinstance(id, str) for id in ids) for ids in split.values()
-    )
-    if not isinstance(config, dict) or not are_ids or set(split) != {"train", "held_out"}:
-        raise SdfhubError(f"run={run}: config.yaml or split.json is not what training writes")
-    return config, split
+    except (ValueError, KeyError, RecursionError, yaml.YAMLError) as error:
+        what = "config.yaml or split.json is not what training writes"
+        raise SdfhubError(f"run={run}: {what} ({str(error).splitlines()[0]})") from error
 
 
 def data_of(config: dict[str, Any], trust: str | tuple[str, ...] = ()) -> "SdfDataModule":
-    """The data that a run's config describes.
-
-    Raises:
-        SdfhubError: it describes none, or names a class of a package that is not trusted.
-    """
+    """The data that a run's config describes; a class of a package that is not trusted is refused."""
     from sdfhub.data.loading import SdfDataModule  # here: it needs Lightning, and a space does not
 
-    if "data" not in config:
-        raise SdfhubError("the run's config.yaml says nothing of its data")
-    data = built(with_environment(config["data"]), "data", trust, within="sdfhub.data")
+    data = built(with_environment(config.get("data")), "data", trust, within="sdfhub.data")
     if not isinstance(data, SdfDataModule):
         raise SdfhubError("the run's config.yaml describes no data")
     return data
@@ -163,31 +145,22 @@ def beside(run: str, out: str | None, name: str) -> Path:
     return Path(out) if out else (Path(run) if Path(run).is_dir() else Path(run).parent) / name
 
 
-def _of_run(run: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+def _of_run(run: Path) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
     config, split = read_run(run)
-    checkpoint = run / "checkpoints" / LAST
+    checkpoint, frames, metrics = run / "checkpoints" / LAST, run / "frames.json", run / "metrics.json"
     content = read_checkpoint(checkpoint)
     weights = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(weights, dict) or getattr(weights.get("codes.table"), "ndim", 0) != 2:
         raise SdfhubError(f"{checkpoint}: not a checkpoint of an auto-decoder")
     codes = weights.pop("codes.table")
     weights = {name.removeprefix("decoder."): weight for name, weight in weights.items()}
-    frames = _json(run / "frames.json", {"up": "z", "shapes": {}})
-    about: About = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
-    about |= {"metrics": _json(run / "metrics.json", None), "up": frames["up"], "frames": frames["shapes"]}
-    return about, weights, codes
+    about: dict[str, Any] = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}
+    about["metrics"] = json.loads(metrics.read_bytes()) if metrics.exists() else None
+    known = json.loads(frames.read_bytes()) if frames.exists() else {"up": "z", "shapes": {}}
+    return about | {"up": known["up"], "frames": known["shapes"]}, weights, codes
 
 
-def _json(path: Path, otherwise: Any) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return otherwise
-    except (ValueError, OSError, RecursionError) as error:
-        raise SdfhubError(f"{path}: is broken: {error}") from error
-
-
-def _of_file(path: Path) -> tuple[About, dict[str, Tensor], Tensor]:
+def _of_file(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

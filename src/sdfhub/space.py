@@ -47,33 +47,19 @@ Shape = str | int | Array
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Space:
-    """A decoder, the codes of the shapes it was trained on, and what is known of them.
+    """A decoder, the codes of the shapes it was trained on, and what is known of them."""
 
-    Args:
-        decoder: f_theta, in evaluation mode, its weights without gradients.
-        codes: [S, L] float32, on the decoder's device.
-        ids: of the S shapes, in the order of the codes.
-        frames: where shapes lie in their sources' frames, as far as it is known.
-        up: the axis that points up in the source's frame, for pictures.
-        model: what its model is made of: plain data.
-        config: what the training was composed of: plain data.
-        metrics: what `metrics.json` of the run holds; None where nothing was judged.
-        delta: clamp of distances in the training; codes of other shapes are fitted under the same.
-        evidence: makes observations of scans.
-        fitter: finds the codes behind observations.
-    """
-
-    decoder: Decoder
-    codes: Tensor
-    ids: tuple[str, ...]
-    frames: Mapping[str, Frame]
-    up: Literal["y", "z"]
-    model: dict[str, Any]
-    config: dict[str, Any]
-    metrics: dict[str, Any] | None
-    delta: float = 0.1
-    evidence: Evidence = field(default_factory=Evidence)
-    fitter: Fit = field(default_factory=GaussNewtonFit)
+    decoder: Decoder  # f_theta, in evaluation mode, its weights without gradients
+    codes: Tensor  # [S, L] float32, on the decoder's device
+    ids: tuple[str, ...]  # of the S shapes, in the order of the codes
+    frames: Mapping[str, Frame]  # where shapes lie in their sources' frames, as far as it is known
+    up: Literal["y", "z"]  # the axis that points up in the source's frame, for pictures
+    model: dict[str, Any]  # what its model is made of: plain data
+    config: dict[str, Any]  # what the training was composed of: plain data
+    metrics: dict[str, Any] | None  # what `metrics.json` of the run holds; None where nothing was judged
+    delta: float = 0.1  # clamp of distances in the training; codes of other shapes are fitted under the same
+    evidence: Evidence = field(default_factory=Evidence)  # makes observations of scans
+    fitter: Fit = field(default_factory=GaussNewtonFit)  # finds the codes behind observations
 
     def __repr__(self) -> str:
         return f"Space({len(self.ids)} shapes, codes of {self.codes.shape[1]} numbers, {self.up} up)"
@@ -81,9 +67,9 @@ class Space:
     def __post_init__(self):
         for id in self.ids:
             check_id(id)
-        if self.codes.shape != (len(self.ids), self.decoder.code_size) or not len(self.ids):
-            wanted = [len(self.ids), self.decoder.code_size]
-            raise ValueError(f"codes: expected {wanted}, at least one, got {list(self.codes.shape)}")
+        wanted = (len(self.ids), self.decoder.code_size)
+        if self.codes.shape != wanted or not self.ids:
+            raise ValueError(f"codes: expected {wanted}, at least one, got {tuple(self.codes.shape)}")
         if self.codes.dtype != torch.float32 or not torch.isfinite(self.codes).all():
             raise ValueError("codes: must be finite float32 numbers")
         if len(set(self.ids)) < len(self.ids) or not self.frames.keys() <= set(self.ids):
@@ -97,37 +83,30 @@ class Space:
         return self.codes.device
 
     def row(self, shape: str | int | np.integer) -> int:
-        """The row of a shape in the code table.
-
-        Raises:
-            SdfhubError: there is no such shape; names the id that is spelt most alike.
-        """
+        """The row of a shape in the code table."""
         if isinstance(shape, str):
             if shape in self.ids:
                 return self.ids.index(shape)
-            near = get_close_matches(shape, self.ids, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(self.ids[:3])} ..."
-            raise SdfhubError(f"this space was not trained on a shape {shape!r}; {hint}")
+            near = get_close_matches(shape, self.ids, n=3, cutoff=0)
+            raise SdfhubError(
+                f"this space was not trained on a shape {shape!r}; it has {', '.join(near)} ..."
+            )
         if isinstance(shape, bool) or not 0 <= shape < len(self.ids):
             raise SdfhubError(f"this space has no row {shape}; its rows are 0 to {len(self.ids) - 1}")
         return int(shape)
 
     def code(self, shape: Shape | Sequence[Shape]) -> Tensor:
-        """The code [L] of a shape, or the codes [B, L] of several.
-
-        Raises:
-            SdfhubError: a shape that is not there, or a code of another size.
-        """
+        """The code [L] of a shape, or the codes [B, L] of several."""
         if isinstance(shape, str | int | np.integer):
             return self.codes[self.row(shape)]
         if isinstance(shape, Sequence):
             if not shape:
                 raise SdfhubError("no shape is named")
             return torch.stack([self._single_code(item) for item in shape])
-        code = self._tensor(shape)
-        if code.dim() not in (1, 2) or code.shape[-1] != self.codes.shape[1]:
-            what = f"a code is an array or tensor of {self.codes.shape[1]} numbers"
-            raise SdfhubError(f"a shape is an id, a row or a code, and {what}; got {list(code.shape)}")
+        code, size = self._tensor(shape), self.codes.shape[1]
+        if code.dim() not in (1, 2) or code.shape[-1] != size:
+            what = f"an id, a row or a code, an array or tensor of {size} numbers"
+            raise SdfhubError(f"a shape is {what}; got {list(code.shape)}")
         return code
 
     def _single_code(self, shape: Shape) -> Tensor:
@@ -145,22 +124,16 @@ class Space:
     def sdf(self, points: Array, shape: Shape | Sequence[Shape]) -> Tensor:
         """Signed distances [N] at points [N, 3] of one shape, or [B, N] at [B, N, 3] of B; negative inside.
 
-        Differentiable by points and codes, as often as the decoder is.
-
-        Args:
-            points: normalised frame.
-            shape: one, or as many as points has rows.
+        Points are in the normalised frame. Differentiable by points and codes, as often as the decoder is.
         """
         points, codes = self._tensor(points), self.code(shape)
-        is_one = points.dim() == 2
-        if points.shape[-1:] != (3,) or points.dim() != codes.dim() + 1:
+        if points.dim() < 2 or points.shape != (*codes.shape[:-1], points.shape[-2], 3):
             what = f"points {list(points.shape)} and codes {list(codes.shape)}"
             raise SdfhubError(f"sdf takes points [N, 3] of one shape or [B, N, 3] of B shapes, got {what}")
-        points, codes = (points[None], codes[None]) if is_one else (points, codes)
-        if len(points) != len(codes):
-            raise SdfhubError(f"sdf: points of {len(points)} shapes, but codes of {len(codes)}")
         if not points.numel():
-            return points.new_zeros(points.shape[1:-1] if is_one else points.shape[:-1])
+            return points.new_zeros(points.shape[:-1])
+        is_one = points.dim() == 2
+        points, codes = (points[None], codes[None]) if is_one else (points, codes)
         differentiated = torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)
         sdf = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
         return sdf[0] if is_one else sdf
@@ -168,12 +141,8 @@ class Space:
     def mesh(self, shape: Shape, resolution: int = 256) -> Mesh:
         """The surface of a shape, in its source's frame or, where a code has none, the normalised one.
 
-        Args:
-            shape: which.
-            resolution: points along an axis of the grid, >= 2.
-
-        Returns:
-            vertices [V, 3] float64 and faces [F, 3] int64; V = F = 0 where the field has no zero level.
+        Vertices [V, 3] float64 and faces [F, 3] int64 from a grid of `resolution` >= 2 points along an axis;
+        V = F = 0 where the field has no zero level.
         """
         return next(self.meshes([shape], resolution))
 
@@ -218,16 +187,7 @@ class Space:
     def fit_scan(
         self, scan: Scan, frame: Literal["shape", "normalised"] | Frame = "shape", seed: int = 0
     ) -> Tensor:
-        """The code [L] of a scanned shape.
-
-        Args:
-            scan: from a file or from arrays.
-            frame: as `fit` has it.
-            seed: of the choice of points.
-
-        Raises:
-            SdfhubError: the scan does not fit the frame, or its mesh cannot be trusted.
-        """
+        """The code [L] of a scan from a file or from arrays; frame and seed are as for `fit`."""
         if not isinstance(frame, Frame) and frame not in ("shape", "normalised"):
             raise SdfhubError(f"frame={frame!r}: must be 'shape', 'normalised' or a Frame")
         frame = NORMALIZED if frame == "normalised" else frame
@@ -247,12 +207,10 @@ class Space:
     def neighbours(self, shape: Shape, k: int = 5) -> list[tuple[str, float]]:
         """Ids of the k shapes with the nearest codes, and how far they are; a shape is not its own."""
         _check_count("k", k, 1)
-        distances = (self.codes - self._single_code(shape).detach()).norm(dim=1)
-        if isinstance(shape, str | int | np.integer):
-            distances[self.row(shape)] = torch.inf
-        values, rows = distances.topk(min(k, len(self.ids)), largest=False)
-        nearest = zip(rows.tolist(), values.tolist(), strict=True)
-        return [(self.ids[row], value) for row, value in nearest if np.isfinite(value)]
+        own = self.row(shape) if isinstance(shape, str | int | np.integer) else None
+        distances = (self.codes - self._single_code(shape).detach()).norm(dim=1).tolist()
+        nearest = sorted((value, row) for row, value in enumerate(distances) if row != own)
+        return [(self.ids[row], value) for value, row in nearest[:k]]
 
     def unusual(self, shape: Shape | Sequence[Shape]) -> Tensor:
         """How far codes lie from the middle of the known ones, [] or [B]: about 1 for these.
@@ -280,7 +238,8 @@ class Space:
 
     def _tensor(self, array: Array) -> Tensor:
         try:
-            return torch.as_tensor(_contiguous(array), dtype=torch.float32, device=self.device)
+            plain = array if isinstance(array, Tensor) else np.array(array)  # torch takes no reversed view
+            return torch.as_tensor(plain, dtype=torch.float32, device=self.device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise SdfhubError(f"expected an array or tensor of numbers, got {array!r:.60}") from error
 
@@ -291,25 +250,12 @@ def _check_count(name: str, value: int, least: int) -> None:
 
 
 def _numbers(array: Any) -> Any:
-    return None if array is None else torch.as_tensor(_contiguous(array)).detach().cpu().double().numpy()
-
-
-def _contiguous(array: Array) -> Array:
-    """The same; a copy of a reversed numpy array, which torch does not take."""
-    return np.ascontiguousarray(array) if isinstance(array, np.ndarray) and array.ndim else array
+    array = array.detach().cpu().numpy() if isinstance(array, Tensor) else array
+    return None if array is None else np.array(array, np.float64)
 
 
 def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:
-    """The zero levels of f(., z) of S codes, meshed together, one after another; empty without one.
-
-    Args:
-        decoder: in evaluation mode.
-        codes: [S, L].
-        resolution: points along an axis of the grid.
-
-    Yields:
-        vertices [V, 3], normalised frame, and faces [F, 3].
-    """
+    """The zero levels of f(., z) of codes [S, L], normalised frame, meshed together; empty without one."""
     _check_count("resolution", resolution, 2)
 
     def fields(points: Tensor, shapes: Tensor) -> Tensor:

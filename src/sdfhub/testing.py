@@ -1,6 +1,6 @@
 """Checks for rivals of one's own: `check_derivatives(MyActivation, a=2.0)` raises where one is wrong."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -11,23 +11,20 @@ from sdfhub.model.activations import Activation, new_activation
 from sdfhub.model.conditioning import Layer
 from sdfhub.model.encodings import Encoding, as_encoding
 
-TOLERANCE = 1e-4
-"""How far derivatives may be off, of the largest one, in float64."""
+TOLERANCE = 1e-4  # how far derivatives may be off, of the largest one, in float64
+Pair = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def check_derivatives(make: Any, **settings: Any) -> None:
     """Checks an activation, an encoding or a conditioning against differences in float64.
 
     Values, first derivatives, the derivatives of those by points, codes and weights (which a loss of normals
-    needs), shapes, dtypes and finite numbers.
+    needs), shapes, dtypes and finite numbers. An `AssertionError` says what is wrong.
 
     Args:
         make: a class, a partial of one, or an instance: an `Activation` or elementwise module, an `Encoding`
             or module with `features`, or a class of `Layer`.
         settings: arguments of the class.
-
-    Raises:
-        AssertionError: says what is wrong.
     """
     make = partial(make, **settings) if settings else make
     torch.manual_seed(0)
@@ -51,18 +48,9 @@ def _check_activation(activation: Activation) -> None:
     _same(f"{name}: is not elementwise", activation(x[..., :1].contiguous()), value[..., :1])
     at_zero = activation.with_slope(torch.zeros_like(x))
     assert all(part.isfinite().all() for part in at_zero), f"{name}: value or slope at 0 is not finite"
-    have, slope = activation.with_slope(x)
-    _same(f"{name}: with_slope gives another value than forward", have, value)
-    _check_gradient(f"{name}: forward has a wrong derivative", activation, x)
-    _same(f"{name}: with_slope gives a wrong slope", slope, torch.autograd.grad(value.sum(), x)[0])
-    _check_gradient(
-        f"{name}: the slope has a wrong derivative", activation, x, lambda x: activation.with_slope(x)[1]
-    )
-    _check_kinds(name, activation, activation.with_slope, x)
-    bounds = activation.weight_bound(64), activation.bias_bound()
-    assert all(bound is None or 0 < bound < float("inf") for bound in bounds), (
-        f"{name}: weight_bound and bias_bound must be positive, got {bounds[0]} and {bounds[1]}"
-    )
+    _check_pair(f"{name}: with_slope", activation, x, activation.with_slope, torch.ones_like(x))
+    for bound in (activation.weight_bound(64), activation.bias_bound()):
+        assert bound is None or 0 < bound < float("inf"), f"{name}: a bound must be positive, got {bound}"
 
 
 def _check_encoding(encoding: Encoding) -> None:
@@ -78,12 +66,7 @@ def _check_encoding(encoding: Encoding) -> None:
         features, pullback = encoding.with_pullback(points)
         return features, pullback(cotangent.to(points.dtype))
 
-    features, by_points = pulled(points)
-    _same(f"{name}: with_pullback gives other features than forward", features, value)
-    _check_gradient(f"{name}: forward has a wrong derivative", encoding, points)
-    _same(f"{name}: the pullback is wrong", by_points, torch.autograd.grad(value, points, cotangent)[0])
-    _check_gradient(f"{name}: wrong second derivative", encoding, points, lambda points: pulled(points)[1])
-    _check_kinds(name, encoding, pulled, points)
+    _check_pair(f"{name}: with_pullback", encoding, points, pulled, cotangent)
 
 
 def _check_layer(layer: Layer, code: int) -> None:
@@ -100,19 +83,33 @@ def _check_layer(layer: Layer, code: int) -> None:
     _same(f"{name}: the product is not linear in its inputs", twice[0], 2 * product)
     _same(f"{name}: the shift depends on the inputs", twice[1], shift)
     cotangent = torch.randn_like(product, requires_grad=True)
-    parts = layer.pullback(cotangent, codes)
-    for part, size in zip(parts, (hidden, encoding), strict=True):
+    for part, size in zip(layer.pullback(cotangent, codes), (hidden, encoding), strict=True):
         assert (part is None) == (size == 0), f"{name}: pullback must give None for what is not read, alone"
 
     def pulled(cotangent: Tensor) -> Tensor:
         return torch.cat([part for part in layer.pullback(cotangent, codes) if part is not None], dim=-1)
 
-    _same(
-        f"{name}: the pullback is wrong",
-        pulled(cotangent),
-        torch.autograd.grad(product, inputs, cotangent)[0],
-    )
-    _check_gradient(f"{name}: wrong second derivative", layer, cotangent, pulled)
+    want = torch.autograd.grad(product, inputs, cotangent)[0]
+    _same(f"{name}: pullback gives a wrong derivative", pulled(cotangent), want)
+    _check_gradient(f"{name}: pullback has a wrong derivative", layer, cotangent, pulled)
+
+
+def _check_pair(what: str, module: nn.Module, at: Tensor, pair: Pair, cotangent: Tensor) -> None:
+    """Checks the value and its pulled back cotangent: derivatives of both, without gradients, in float32."""
+    have, pulled = pair(at)
+    value = module(at)
+    _same(f"{what} gives another value than forward", have, value)
+    _same(f"{what} gives a wrong derivative", pulled, torch.autograd.grad(value, at, cotangent)[0])
+    _check_gradient(f"{what}: forward has a wrong derivative", module, at, module)
+    _check_gradient(f"{what} has a wrong derivative", module, at, lambda at: pair(at)[1])
+    for mode in (torch.no_grad(), torch.inference_mode()):
+        with mode:
+            for plain, wanted in zip(pair(at), (have, pulled), strict=True):
+                _same(f"{what} gives something else without gradients", plain, wanted.detach())
+    for dtype in (torch.float32, torch.double):
+        module.to(dtype)
+        dtypes = {part.dtype for part in pair(at.detach().to(dtype))}
+        assert dtypes == {dtype}, f"{what} gives {dtypes} of {dtype}"
 
 
 def _same(what: str, have: Tensor, want: Tensor) -> None:
@@ -120,31 +117,14 @@ def _same(what: str, have: Tensor, want: Tensor) -> None:
     assert error <= TOLERANCE * (size + TOLERANCE), f"{what}: off by {error:.1e}, of {size:.1e} at most"
 
 
-def _check_gradient(
-    what: str, module: nn.Module, at: Tensor, function: Callable[[Tensor], Tensor] | None = None
-) -> None:
-    """Compares the gradient of a function (the module's own) by its argument and weights with differences."""
+def _check_gradient(what: str, module: nn.Module, at: Tensor, function: Callable[[Tensor], Tensor]) -> None:
+    """Compares the gradient of a function by its argument and a module's weights with differences."""
     weights = [weight for weight in module.parameters() if weight.requires_grad]
-    call = lambda at, *_: (function or module)(at)  # noqa: E731 # gradcheck moves the weights where they are
+    call = lambda at, *_: function(at)  # noqa: E731 # gradcheck moves the weights where they are
     try:
         torch.autograd.gradcheck(call, (at, *weights), atol=TOLERANCE, rtol=TOLERANCE, fast_mode=True)
     except RuntimeError as error:
         raise AssertionError(f"{what}: {str(error).splitlines()[0]}") from error
-
-
-def _check_kinds(
-    name: str, module: nn.Module, function: Callable[[Tensor], Iterable[Tensor]], at: Tensor
-) -> None:
-    """Checks that nothing changes where gradients are off, and that float32 gives float32."""
-    want = [part.detach() for part in function(at)]
-    for mode in (torch.no_grad(), torch.inference_mode()):
-        with mode:
-            for have, wanted in zip(function(at), want, strict=True):
-                _same(f"{name}: gives something else without gradients", have, wanted)
-    for dtype in (torch.float32, torch.double):
-        module.to(dtype)
-        dtypes = {part.dtype for part in function(at.detach().to(dtype))}
-        assert dtypes == {dtype}, f"{name}: gives {dtypes} of {dtype}"
 
 
 def _shaken(module: Any) -> Any:

@@ -4,6 +4,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -18,20 +19,20 @@ from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape, draw_rows
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import SdfhubError
-from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, pictured, write_reconstruction, write_scores
-from sdfhub.geometry.mesher import Mesh
-from sdfhub.geometry.metrics import Judge
+from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, write_scores
+from sdfhub.geometry.mesh_file import write_mesh
+from sdfhub.geometry.metrics import judge_pair
+from sdfhub.geometry.render import render
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
 from sdfhub.scans.observed_scan import observations_of
-from sdfhub.shapes import NormalizedMesh
+from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.space import reconstruct
 
 log = logging.getLogger(__name__)
 
-# shapes to judge for which a worker process is started: it takes as long to start as to judge one or two
-WORTH_A_PROCESS = 4
+WORTH_A_PROCESS = 4  # shapes to judge: a worker takes as long to start as to judge one or two
 NOISE = 64
 """Faces, in squared resolutions, above which a mesh is noise: ten times those of the unit sphere. What a
 training that diverged leaves crosses zero in every cell: it is no surface, and would take gigabytes."""
@@ -42,29 +43,17 @@ Role = tuple[str, StoredShape, Tensor]
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
 class Evaluation:
-    """How a shape space is judged.
+    """How a shape space is judged."""
 
-    Args:
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side for Chamfer distance and F-score.
-        train: training shapes to judge, from the front of the code table; None judges all.
-        held_out: held-out shapes to judge; None judges all.
-        fit: how codes of held-out shapes are found.
-        fit_together: held-out shapes fitted side by side.
-        pictures: shapes of each role on the contact sheet.
-        workers: processes that judge; None for one per core.
-        seed: of every draw.
-    """
-
-    resolution: Annotated[int, Field(ge=2)]
-    points: PositiveInt
-    train: NonNegativeInt | None
-    held_out: NonNegativeInt | None
-    fit: SkipValidation[Fit]
-    fit_together: PositiveInt
-    pictures: NonNegativeInt
-    workers: NonNegativeInt | None = None
-    seed: NonNegativeInt = 0
+    resolution: Annotated[int, Field(ge=2)]  # points along an axis of the marching-cubes grid
+    points: PositiveInt  # surface points a side for Chamfer distance and F-score
+    train: NonNegativeInt | None  # training shapes to judge, from the front of the code table; None: all
+    held_out: NonNegativeInt | None  # held-out shapes to judge; None: all
+    fit: SkipValidation[Fit]  # how codes of held-out shapes are found
+    fit_together: PositiveInt  # held-out shapes fitted side by side
+    pictures: NonNegativeInt  # shapes of each role on the contact sheet
+    workers: NonNegativeInt | None = None  # processes that judge; None: one per core
+    seed: NonNegativeInt = 0  # of every draw
 
 
 def evaluate_model(
@@ -79,20 +68,9 @@ def evaluate_model(
 ) -> dict[str, Any]:
     """Judges training and held-out shapes; writes tables, meshes and pictures below `out`.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by their signed distances alone.
-
-    Args:
-        decoder: trained.
-        codes: [S, L] code table.
-        delta: clamp of distances that the decoder was trained with; codes are fitted under the same.
-        train: shapes that it was trained on, by row of the table.
-        held_out: shapes that it has not seen.
-        evaluation: how to judge.
-        out: folder of the results.
-        training: plain numbers about the training, to be kept beside the scores.
-
-    Returns:
-        What `metrics.json` holds.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Training shapes are
+    named by their rows of the codes [S, L]; codes of others are fitted under the training's clamp `delta`.
+    Returned is what `metrics.json` holds, plain numbers about the training included.
     """
     decoder.eval()
     roles: list[Role]
@@ -122,34 +100,34 @@ def fit_held_out(
 
 
 def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, out: Path) -> list[Judged]:
-    """Reconstructs shapes one after another, while worker processes judge those before.
+    """Reconstructs shapes with meshes one after another, while worker processes judge those before.
 
-    A mesh is written and drawn when it is made, and not kept: a thousand would not fit into memory.
-
-    Args:
-        decoder: in evaluation mode.
-        roles: shapes with meshes.
-        evaluation: how to judge; its `workers` change speed, not scores.
-        out: folder of the results, for the meshes.
+    A mesh is written to `out`/meshes, in its source's frame, and drawn when it is made, and not kept: a
+    thousand would not fit into memory.
     """
-    pictures, of_role = [], Counter[str]()
+    pictures: list[tuple[np.ndarray, np.ndarray | str] | None] = []
+    of_role = Counter[str]()
 
     def pairs() -> Iterator[tuple[Mesh, NormalizedMesh]]:
         for role, shape, code in tqdm(roles, desc="judging", unit="shape", leave=False, disable=None):
-            (mesh,) = reconstruct(decoder, code[None], evaluation.resolution)
-            if len(mesh[1]) > NOISE * evaluation.resolution**2:
-                log.warning("%s: its field is noise, %s faces: no surface", shape.id, f"{len(mesh[1]):,}")
-                mesh = Mesh(mesh[0][:0], mesh[1][:0])
-            write_reconstruction(role, shape, mesh, out)
+            ((vertices, faces),) = reconstruct(decoder, code[None], evaluation.resolution)
+            if len(faces) > NOISE * evaluation.resolution**2:
+                log.warning("%s: its field is noise, %s faces: no surface", shape.id, f"{len(faces):,}")
+                vertices, faces = vertices[:0], faces[:0]
+            path, truth = out / "meshes" / role / f"{shape.id}.ply", cast(NormalizedMesh, shape.mesh)
+            write_mesh(shape.frame.to_source(vertices), faces, path)
             of_role[role] += 1
-            truth = cast(NormalizedMesh, shape.mesh)
-            shown = of_role[role] <= evaluation.pictures
-            pictures.append(pictured(truth, mesh, shape.up) if shown else None)
-            yield mesh, truth
+            pair = None
+            if of_role[role] <= evaluation.pictures:
+                drawn = render(vertices, faces, up=shape.up) if len(faces) else "no surface"
+                pair = render(truth.vertices, truth.faces, up=shape.up), drawn
+            pictures.append(pair)
+            yield Mesh(vertices, faces), truth
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
-    judged = dict(map_in_processes(Judge(evaluation.points, evaluation.seed), pairs(), workers))
+    judge_one = partial(judge_pair, points=evaluation.points, seed=evaluation.seed)
+    judged = dict(map_in_processes(judge_one, pairs(), workers))
     metrics = [judged[index] for index in range(len(roles))]
     if any(isinstance(row, Crashed) for row in metrics):
         raise SdfhubError("a process that judges died twice: out of memory? try evaluate.workers=0")

@@ -1,6 +1,7 @@
 """What a training ran with: versions and hardware, kept beside its scores so that both can be told."""
 
 import platform
+import re
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,8 +26,6 @@ def made_with(trainer: Trainer) -> dict[str, str]:
 
 
 def _processor() -> str:
-    """The processor's name; Python itself knows it on few systems."""
     cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or "unknown"
+    name = re.search(r"model name\s*: (.*)", cpuinfo.read_text("utf-8")) if cpuinfo.exists() else None
+    return name[1] if name else platform.processor() or "unknown"

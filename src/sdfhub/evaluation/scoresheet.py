@@ -4,19 +4,15 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.geometry.contact_sheet import contact_sheet
-from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.mesher import Mesh
 from sdfhub.geometry.metrics import STATISTICS, ShapeMetrics, summarize
-from sdfhub.geometry.render import render
-from sdfhub.geometry.up_axis import UpAxis
-from sdfhub.shapes import NormalizedMesh
+from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -37,49 +33,20 @@ TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
 
 @dataclass(frozen=True)
 class DistanceMetrics:
-    """The judgement of a field where the source has no mesh.
+    """The judgement of a field where the source has no mesh."""
 
-    Args:
-        sdf_error: mean |f - d| over samples with |d| < delta, normalised units.
-        sign_accuracy: share of samples on the right side.
-    """
-
-    sdf_error: float
-    sign_accuracy: float
+    sdf_error: float  # mean |f - d| over samples with |d| < delta, normalised units
+    sign_accuracy: float  # share of samples on the right side
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One judged shape: who it is, how good it is and, where it is on the sheet, what it looks like.
+    """One judged shape: who it is, how good it is and, where it is on the sheet, what it looks like."""
 
-    Args:
-        role: `train` or `held_out`.
-        shape: the truth.
-        metrics: of its reconstruction.
-        pictures: of the truth and of the reconstruction; words stand for a surface that is not there.
-    """
-
-    role: str
+    role: str  # `train` or `held_out`
     shape: StoredShape
     metrics: ShapeMetrics | DistanceMetrics
-    pictures: tuple[np.ndarray, np.ndarray | str] | None = None
-
-    @property
-    def failed(self) -> bool:
-        """Whether the reconstruction has no surface."""
-        return isinstance(self.metrics, ShapeMetrics) and self.metrics.failed
-
-
-def write_reconstruction(role: str, shape: StoredShape, mesh: Mesh, out: Path) -> None:
-    """Writes a reconstruction in the normalised frame below `out`/meshes, in that of the source's meshes."""
-    vertices, faces = mesh
-    write_mesh(shape.frame.to_source(vertices), faces, out / "meshes" / role / f"{shape.id}.ply")
-
-
-def pictured(truth: NormalizedMesh, mesh: Mesh, up: UpAxis) -> tuple[np.ndarray, np.ndarray | str]:
-    """Pictures of a shape and of its reconstruction, normalised frame."""
-    reconstruction = render(*mesh, up=up) if len(mesh.faces) else "no surface"
-    return render(truth.vertices, truth.faces, up=up), reconstruction
+    pictures: tuple[np.ndarray, np.ndarray | str] | None = None  # truth, reconstruction; words: no surface
 
 
 def write_scores(
@@ -87,48 +54,40 @@ def write_scores(
 ) -> dict[str, Any]:
     """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
 
-    Args:
-        judged: what was judged, in the order of the table.
-        evaluation: a dataclass of the settings, kept beside the numbers.
-        training: plain numbers about the training, likewise; None where nothing was trained.
-        out: folder of the results.
-
-    Returns:
-        What `metrics.json` holds: the settings and, per role, a `summary` and the rows of its `shapes`.
+    Returns what `metrics.json` holds: the settings (a dataclass), plain numbers about the training and, per
+    role, a `summary` and the rows of its `shapes`, in the order in which they were judged.
     """
     import pandas  # here: slow to import, and every training would wait for it before its first step
 
     result: dict[str, Any] = {"evaluation": asdict(evaluation), "training": training}
     for role, rows in _by_role(judged).items():
         shapes = [{"id": row.shape.id, **asdict(row.metrics)} for row in rows]
-        result[role] = {"summary": _summary(rows), "shapes": shapes}
+        result[role] = {"summary": _summary([row.metrics for row in rows]), "shapes": shapes}
     table_rows = [{"role": row.role, "id": row.shape.id, **asdict(row.metrics)} for row in judged]
     write_whole(out / "metrics.csv", pandas.DataFrame(table_rows).to_csv(index=False))
     log.info(table(judged))
-    if any(not isinstance(row.metrics, ShapeMetrics) for row in judged):
+    if any(isinstance(row.metrics, DistanceMetrics) for row in judged):
         log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
-    else:
-        log.info("\nmeshes:        %s", out / "meshes")
     if pictures := [row.pictures for row in judged if row.pictures]:
-        captions = [f"{row.shape.id}\n{_title(row)}" for row in judged if row.pictures]
-        sheet = list(zip(*pictures, strict=True))
-        path = contact_sheet(sheet, ["ground truth", "reconstruction"], captions, out / "contact_sheet.png")
-        log.info("contact sheet: %s", path)
+        captions, labels = (
+            [_caption(row) for row in judged if row.pictures],
+            ["ground truth", "reconstruction"],
+        )
+        contact_sheet(list(zip(*pictures, strict=True)), labels, captions, out / "contact_sheet.png")
     # last: a run that has it is finished
     write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
-    log.info("metrics:       %s", out / "metrics.json")
+    log.info("\nscores, meshes and contact sheet: %s", out)
     return result
 
 
-def _summary(rows: Sequence[Judged]) -> dict[str, Any]:
-    shapes = [row.metrics for row in rows if isinstance(row.metrics, ShapeMetrics)]
-    if len(shapes) == len(rows):
-        return summarize(shapes)
-    summary = {}
-    for name in asdict(rows[0].metrics):
-        values = [getattr(row.metrics, name) for row in rows]
-        summary[name] = {key: float(statistic(values)) for key, statistic in STATISTICS.items()}
-    return summary
+def _summary(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, Any]:
+    judged = [row for row in metrics if isinstance(row, ShapeMetrics)]
+    if len(judged) == len(metrics):
+        return summarize(judged)
+    values = {name: [getattr(row, name) for row in metrics] for name in asdict(metrics[0])}
+    return {
+        name: {key: float(of(column)) for key, of in STATISTICS.items()} for name, column in values.items()
+    }
 
 
 def table(judged: Sequence[Judged]) -> str:
@@ -140,7 +99,7 @@ def table(judged: Sequence[Judged]) -> str:
         scores = pandas.DataFrame([asdict(row.metrics) for row in rows], [row.shape.id for row in rows])
         columns = {name: column for name, column in COLUMNS.items() if name in scores}
         frame = scores[list(columns)].astype(float) * [factor for _, factor in columns.values()]
-        failed = [row.failed for row in rows]
+        failed = [getattr(row.metrics, "failed", False) for row in rows]
         frame.columns = pandas.Index([heading for heading, _ in columns.values()], name=TITLES[role])
         frame.loc[failed] = np.nan
         summary = frame.agg(["mean", "median"])
@@ -151,10 +110,9 @@ def table(judged: Sequence[Judged]) -> str:
 
 
 def _by_role(judged: Sequence[Judged]) -> dict[str, list[Judged]]:
-    roles = dict.fromkeys(row.role for row in judged)
-    return {role: [row for row in judged if row.role == role] for role in roles}
+    return {role: list(rows) for role, rows in groupby(judged, lambda row: row.role)}
 
 
-def _title(row: Judged) -> str:
-    cd = None if isinstance(row.metrics, DistanceMetrics) else row.metrics.cd
-    return f"{row.role.replace('_', '-')}, {'no surface' if cd is None else f'CD {cd * 1e3:.3f}'}"
+def _caption(row: Judged) -> str:
+    cd = getattr(row.metrics, "cd", None)
+    return f"{row.shape.id}\n{row.role}, {'no surface' if cd is None else f'CD {cd * 1e3:.3f}'}"

@@ -28,33 +28,20 @@ class Validation:
 
     It is coarse, to cost little: good for comparing states of one training, not for tables. The same samples
     are drawn every time. It changes neither weights nor random states of a training.
-
-    Args:
-        fit: finds the codes of held-out shapes.
-        resolution: points along an axis of the marching-cubes grid.
-        points: surface points a side of the Chamfer distance.
-        delta: clamp of distances in the training, normalised frame.
-        seed: of all samples.
     """
 
-    fit: SkipValidation[Fit]
-    resolution: Annotated[int, Field(ge=2)] = 64
-    points: PositiveInt = 10_000
-    delta: PositiveFloat = 0.1
-    seed: NonNegativeInt = 0
+    fit: SkipValidation[Fit]  # finds the codes of held-out shapes
+    resolution: Annotated[int, Field(ge=2)] = 64  # points along an axis of the marching-cubes grid
+    points: PositiveInt = 10_000  # surface points a side of the Chamfer distance
+    delta: PositiveFloat = 0.1  # clamp of distances in the training, normalised frame
+    seed: NonNegativeInt = 0  # of all samples
 
     def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
-        """The scores of one shape.
+        """The scores of one shape, from a decoder in evaluation mode and codes [S, L].
 
-        Args:
-            decoder: in evaluation mode.
-            item: the shape.
-            codes: [S, L] code table.
-
-        Returns:
-            `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units. `cd`: Chamfer distance
-            times 10^3, squared normalised units, where the shape has a mesh. A reconstruction without surface
-            counts as one point at the origin, far worse than any other, so that monitors have a number.
+        `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units. `cd`: Chamfer distance
+        times 10^3, squared normalised units, where the shape has a mesh. A reconstruction without surface
+        counts as one point at the origin, far worse than any other, so that monitors have a number.
         """
         rows = signed_samples(item.shape, self.fit.samples or self.points, np.random.default_rng(self.seed))
         with torch.inference_mode(False), torch.no_grad():  # fits need derivatives

@@ -1,18 +1,19 @@
 """Which parts of a grid the zero level of a field can pass, from few evaluations, for many shapes at once.
 
 A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2, the finest thing that is skipped.
-Cells are rows [shape, i, j, k]. A cell is sampled at its *centre*, the node s / 2 steps above its lowest
-corner, or the grid's last one. Slopes are per grid step.
+Cells are rows [shape, i, j, k], sampled at their *centres*, s / 2 steps above the lowest corner. Slopes are
+per grid step.
 
-A centre with the value f decides the sign of every node of its cell within |f| / L steps, where L bounds the
-slope of the field in the cell; a cell whose nodes are all decided is skipped. Of the blocks left, only nodes
-that no block decides are evaluated, and those of cells on which the sign changes. L is the steepest slope
-between samples around the cell, times a safety factor, and never below the slopes near the surface: networks
-trained with clamped distances may be steeper than 1 or nearly flat. Missed blocks are found by growing:
-wherever a sign change leaves the blocks, the neighbour joins them, and when an inferred sign proves wrong,
-all are evaluated again. So a connected piece of surface is found whole or not at all.
+A centre with the value f decides the sign of every node within |f| / L steps, where L bounds the slope of the
+field in the cell; a cell whose nodes are all decided is skipped. Of the blocks left, only nodes that no block
+decides are evaluated, and those of cells on which the sign changes. L is the steepest slope between samples
+around the cell, times SAFETY, and never below the slopes near the surface: networks trained with clamped
+distances may be steeper than 1 or nearly flat. Wherever a sign change leaves the blocks, the neighbour joins
+them, and when an inferred sign proves wrong, all are evaluated again. So a connected piece of surface is
+found whole or not at all.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ from scipy.ndimage import maximum_filter
 
 from sdfhub.geometry.grid import Grid
 
+COARSE = 32  # cells per axis at the coarsest level, about: strides are powers of two
+SAFETY = 1.25  # factor on the measured slopes; a larger one misses less and evaluates more
 _SMALL = 16  # below this many nodes per axis a coarse level says nothing
 _NEAR = 0.05  # share of the coarse samples, those nearest to zero, that set the least slope
 _CHILDREN = np.indices((1, 2, 2, 2)).reshape(4, 8).T
@@ -45,22 +48,18 @@ class SampledCells(NamedTuple):
         return np.abs(self.values) > self.slope * distance
 
 
-def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
-    """The blocks in cells that coarser levels could not skip, those of a shape together.
-
-    Strides are powers of two, with about `coarse` cells per axis first; `safety` multiplies measured slopes.
-    """
-    stride = 2 if grid.n <= _SMALL else 2 ** max(1, round(np.log2((grid.n - 1) / coarse)))
-    m = _cells_per_axis(grid.n, stride)
+def sample_blocks(grid: Grid) -> SampledCells:
+    """The blocks in cells that coarser levels could not skip, those of a shape together."""
+    stride = 2 if grid.n <= _SMALL else 2 ** max(1, round(np.log2((grid.n - 1) / COARSE)))
+    m = -(-(grid.n - 1) // stride)
     cells = np.indices((len(grid.shapes), m, m, m), grid.integers).reshape(4, -1).T
-    values = grid.evaluate(_centre_keys(grid, cells, stride))
+    values = grid.evaluate(_centre_keys(cells, stride, grid.n))
     if grid.n <= _SMALL:
         return SampledCells(cells, values, np.full(len(cells), np.inf))
     fields = values.reshape(-1, m, m, m)
-    bounds = [_slope_bounds(*pair) for pair in zip(np.abs(fields), _slope(fields, stride), strict=True)]
-    sampled = SampledCells(cells, values, safety * np.stack(bounds).reshape(-1))
+    sampled = SampledCells(cells, values, SAFETY * _slope_bounds(fields, stride).reshape(-1))
     while stride > 2:
-        sampled = _refine(grid, sampled.candidates(stride), stride // 2, safety)
+        sampled = _refine(grid, sampled.candidates(stride), stride // 2)
         stride //= 2
     return sampled
 
@@ -68,22 +67,21 @@ def sample_blocks(grid: Grid, coarse: int, safety: float) -> SampledCells:
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
-    Returns:
-        keys [M] of the cells' lowest nodes; keys [K] of nodes, those of the cells among them, each once and
-        in no order; and the values [K] float32.
+    Gives keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once and in no
+    order; and the values [K] float32.
     """
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
-    active = np.zeros((len(grid.shapes), *[_cells_per_axis(grid.n, 2)] * 3), bool)
-    samples = [(_centre_keys(grid, sampled.cells, 2), sampled.values)]
+    active = np.zeros((len(grid.shapes), *[grid.n // 2] * 3), bool)
+    samples = [(_centre_keys(sampled.cells, 2, grid.n), sampled.values)]
     crossed: list[np.ndarray] = [np.empty(0, grid.integers)]
     states[samples[0][0]] = _evaluated_states(sampled.values)
     while len(blocks):
         active[tuple(blocks.T)] = True
-        nodes = _nodes_of(blocks, grid.n)
+        nodes = _node_keys(blocks, 2, range(3), grid.n)
         _evaluate(grid, nodes[states[nodes] == 0], states, samples)
         outside = (states[nodes] & _OUTSIDE) > 0
-        marks = _crossed_cells(outside, blocks, grid.n)
+        marks = _crossed_cells(outside, nodes, grid.n)
         cells, surface = nodes[:, :2, :2, :2][marks], marks.any(axis=(1, 2, 3))
         corners = np.concatenate([cells + _distance(corner, grid.n) for corner in _CHILDREN[:, 1:]])
         if _evaluate(grid, corners, states, samples):
@@ -96,10 +94,10 @@ def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarra
 
 
 def _inferred_states(grid: Grid, sampled: SampledCells) -> np.ndarray:
-    """States of all nodes of the grid, flat, inferred from blocks; those that leave the grid are left out."""
+    """States of all nodes of the grid, flat, inferred from the blocks that lie wholly within it."""
     states = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
     sampled = sampled.where((2 * sampled.cells[:, 1:] + 2 < grid.n).all(axis=1))
-    centres = _centre_keys(grid, sampled.cells, 2)
+    centres = _centre_keys(sampled.cells, 2, grid.n)
     inferred = np.where(sampled.values > 0, _INFERRED | _OUTSIDE, _INFERRED).astype(np.int8)
     offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     for squared in (3, 2, 1):
@@ -115,20 +113,25 @@ def _distance(offset: np.ndarray, n: int) -> int:
     return int(offset @ [n * n, n, 1])
 
 
-def _cells_per_axis(n: int, stride: int) -> int:
-    return -(-(n - 1) // stride)
-
-
-def _centre_keys(grid: Grid, cells: np.ndarray, stride: int) -> np.ndarray:
+def _node_keys(cells: np.ndarray, stride: int, steps: Sequence[int], n: int) -> np.ndarray:
+    """Keys [C, S, S, S] of nodes `steps` [S] above cells' lowest corners, or of the grid's last nodes."""
     shape, *ijk = cells.T
-    i, j, k = (np.minimum(index * stride + stride // 2, grid.n - 1) for index in ijk)
-    return ((shape * grid.n + i) * grid.n + j) * grid.n + k
+    offsets = np.array(steps, cells.dtype)
+    i, j, k = (np.minimum(stride * index[:, None] + offsets, n - 1) for index in ijk)
+    plane = (shape[:, None] * n + i)[:, :, None] * n + j[:, None]
+    return (plane * n)[..., None] + k[:, None, None]
 
 
-def _slope_bounds(size: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """[m, m, m] the steepest slope around a cell, and no less than near the surface."""
-    near = slope[size <= np.quantile(size, _NEAR)]
-    return np.maximum(maximum_filter(slope, 3), np.quantile(near, 0.9))
+def _centre_keys(cells: np.ndarray, stride: int, n: int) -> np.ndarray:
+    return _node_keys(cells, stride, [stride // 2], n).reshape(-1)
+
+
+def _slope_bounds(fields: np.ndarray, stride: int) -> np.ndarray:
+    """[S, m, m, m] the steepest slope around a cell, and no less than near the shape's surface."""
+    slopes = _slope(fields, stride)
+    near = [slope[abs(f) <= np.quantile(abs(f), _NEAR)] for f, slope in zip(fields, slopes, strict=True)]
+    least = np.array([np.quantile(slope, 0.9) for slope in near])[:, None, None, None]
+    return np.maximum(maximum_filter(slopes, (1, 3, 3, 3)), least)
 
 
 def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
@@ -141,22 +144,14 @@ def _slope(values: np.ndarray, spacing: float) -> np.ndarray:
     return np.sqrt(squares) / spacing
 
 
-def _refine(grid: Grid, parents: SampledCells, stride: int, safety: float) -> SampledCells:
+def _refine(grid: Grid, parents: SampledCells, stride: int) -> SampledCells:
     """The children of the cells; `stride` is theirs."""
     first = parents.cells * np.array([1, 2, 2, 2], grid.integers)
     children = (first[:, None] + _CHILDREN.astype(grid.integers)).reshape(-1, 4)
-    values = grid.evaluate(_centre_keys(grid, children, stride))
+    values = grid.evaluate(_centre_keys(children, stride, grid.n))
     siblings = _slope(values.reshape(-1, 2, 2, 2), stride).reshape(-1, 8).max(axis=1, initial=0)
-    slope = np.repeat(np.maximum(parents.slope, safety * siblings), 8)
+    slope = np.repeat(np.maximum(parents.slope, SAFETY * siblings), 8)
     return SampledCells(children, values, slope).where((children[:, 1:] * stride < grid.n - 1).all(axis=1))
-
-
-def _nodes_of(blocks: np.ndarray, n: int) -> np.ndarray:
-    """Keys [C, 3, 3, 3] of the nodes of blocks; where a block leaves the grid, its last nodes again."""
-    shape, *ijk = blocks.T
-    i, j, k = (np.minimum(2 * index[:, None] + np.arange(3, dtype=index.dtype), n - 1) for index in ijk)
-    plane = (shape[:, None] * n + i)[:, :, None] * n + j[:, None]
-    return (plane * n)[..., None] + k[:, None, None]
 
 
 def _evaluate(grid: Grid, keys: np.ndarray, states: np.ndarray, samples: list) -> bool:
@@ -174,17 +169,11 @@ def _evaluated_states(values: np.ndarray) -> np.ndarray:
     return np.where(values > 0, _EVALUATED | _OUTSIDE, _EVALUATED).astype(np.int8)
 
 
-def _crossed_cells(outside: np.ndarray, blocks: np.ndarray, n: int) -> np.ndarray:
-    """[C, 2, 2, 2] whether the sign changes on the cells of blocks with nodes `outside` [C, 3, 3, 3]."""
-    any_outside = all_outside = outside  # of the corners of a cell
-    for axis in (1, 2, 3):
-        low, high = (tuple([slice(None)] * axis + [slice(first, first + 2)]) for first in (0, 1))
-        any_outside = any_outside[low] | any_outside[high]
-        all_outside = all_outside[low] & all_outside[high]
-    crossed = any_outside != all_outside
-    for axis in (1, 2, 3):
-        np.moveaxis(crossed, axis, 1)[:, 1] &= (2 * blocks[:, axis] + 1 < n - 1)[:, None, None]
-    return crossed
+def _crossed_cells(outside: np.ndarray, nodes: np.ndarray, n: int) -> np.ndarray:
+    """[C, 2, 2, 2] whether the sign changes on the cells of blocks with these nodes, `outside` or not."""
+    corners = np.stack([outside[:, i : i + 2, j : j + 2, k : k + 2] for i, j, k in np.ndindex(2, 2, 2)])
+    is_within = nodes[:, 1:, 1:, 1:] - nodes[:, :2, :2, :2] == n * n + n + 1  # no node comes twice
+    return (corners.any(axis=0) != corners.all(axis=0)) & is_within
 
 
 def _crossed_neighbours(active: np.ndarray, blocks: np.ndarray, outside: np.ndarray) -> np.ndarray:

@@ -17,27 +17,18 @@ from sdfhub.shapes import Mesh
 Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """Maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 to signed distances [B, N]."""
 
-# points of one shape in a row of a call: shapes need unequal numbers of points, and share calls in tiles
-TILE = 1024
+TILE = 1024  # points of a shape in a row of a call: shapes need unequal numbers of them, and share calls
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where fields are evaluated, and how many points at a time.
-
-    Args:
-        fields: of all shapes.
-        shapes: the shapes that are evaluated together; keys and arrays count them from 0.
-        n: nodes per axis, >= 2.
-        batch: points per call of `fields`; rounded down to whole tiles, at least one.
-        device: where `fields` expects its arguments.
-    """
+    """Where fields are evaluated, and how many points at a time."""
 
     fields: Fields
-    shapes: range
-    n: int
-    batch: int
-    device: torch.device
+    shapes: range  # those that are evaluated together; keys and arrays count them from 0
+    n: int  # nodes per axis, >= 2
+    batch: int  # points per call of `fields`; rounded down to whole tiles, at least one
+    device: torch.device  # where `fields` expects its arguments
 
     @cached_property
     def axis(self) -> torch.Tensor:
@@ -69,11 +60,7 @@ class Grid:
 
     @torch.no_grad()  # not inference_mode: tensors that a field caches must stay usable in training
     def values_at(self, points: torch.Tensor, shapes: np.ndarray) -> np.ndarray:
-        """The fields [B, N] float32 of shapes [B] at points [B, N, 3].
-
-        Raises:
-            SdfhubError: a value is not finite.
-        """
+        """The fields [B, N] float32 of shapes [B] at points [B, N, 3]; refuses values that are not finite."""
         field = self.fields(points, torch.from_numpy(shapes).to(self.device))
         if field.shape != points.shape[:2]:
             raise ValueError(f"field: expected {list(points.shape[:2])} values, got {list(field.shape)}")

@@ -11,9 +11,9 @@ from sdfhub.shapes import Mesh
 from sdfhub.whole_file import write_whole
 
 FORMATS = ("ply", "obj", "glb")  # formats of written meshes
+# distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as do
+# geographic ones. GLB has no other coordinates; OBJ is text.
 FAR = 16
-"""Distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as in
-geographic coordinates. GLB has no other coordinates; OBJ is text."""
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
@@ -28,7 +28,8 @@ def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
     else:
         import trimesh  # here: slow to import, and every training would wait for it before its first step
 
-        _export(trimesh.Trimesh(vertices, faces, process=False), path)
+        mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
+        write_whole(path, mesh.export(file_type=path.suffix[1:]))
 
 
 def _ply(vertices: np.ndarray, faces: np.ndarray) -> bytes:
@@ -53,8 +54,4 @@ def write_row(meshes: Sequence[Mesh], up: UpAxis, path: Path) -> None:
             moved = trimesh.Trimesh(turned_up(vertices, up, "y") + [2.1 * index, 0, 0], faces, process=False)
             scene.add_geometry(moved, node_name=f"{index}")
     if scene.geometry:
-        _export(scene, path)
-
-
-def _export(content: Any, path: Path) -> None:
-    write_whole(path, content.export(file_type=path.suffix[1:]))
+        write_whole(path, scene.export(file_type=path.suffix[1:]))

@@ -1,7 +1,7 @@
 """How good a reconstructed mesh is: Chamfer distance, its noise floor, and what Chamfer misses.
 
-All meshes are (vertices [V, 3], faces [F, 3]) in one frame, the normalised one unless a name says `source`.
-Lengths are in that frame's units, Chamfer distances in their squares; nothing is multiplied by 10^3 here.
+Lengths are in units of the meshes' common frame, the normalised one unless a name says `source`, Chamfer
+distances in their squares; nothing is multiplied by 10^3 here.
 
 Two samplings of one surface differ by the *noise floor*, which grows with area and falls with the number of
 points. `excess` is the rest of a Chamfer distance.
@@ -21,9 +21,6 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-Sampled = tuple[np.ndarray, np.ndarray]
-"""Points [N, 3] of a surface and the normals there [N, 3]."""
-
 FAILURES = (
     "failed: shapes without a reconstructed surface. They enter no statistic but cd_mean_with_failures and "
     "cd_median_with_failures, where each counts as if its reconstruction were one point at the origin."
@@ -36,104 +33,82 @@ STATISTICS = {"mean": np.mean, "median": np.median, "p90": partial(np.percentile
 
 @dataclass(frozen=True)
 class ShapeMetrics:
-    """The judgement of one reconstruction; None where a value does not exist.
+    """The judgement of one reconstruction; None where a value does not exist."""
 
-    Args:
-        cd: mean squared nearest distance between samples, both directions added.
-        floor: `cd` of two independent samplings of the ground truth.
-        excess: cd - floor; below 0 by chance where a reconstruction is as good as the truth.
-        cd_source: `cd` in squared units of the source's own frame.
-        point_to_surface: mean of `accuracy` and `completeness`.
-        accuracy, accuracy_p95: mean and 95th percentile of the distance from the reconstruction's samples to
-            the true surface.
-        completeness, completeness_p95: the same from the truth's samples to the reconstructed surface.
-        normal_consistency: mean |n . n'| over nearest samples, both directions averaged, in [0, 1].
-        f_score: harmonic mean of the shares of either side's samples within tau of the other surface.
-        iou: volume of the intersection over that of the union; None unless both meshes are closed.
-        cd_penalty: `cd` of a single point at the origin, which stands for a failed reconstruction.
-        failed: the reconstruction has no surface. Everything but `floor` and `cd_penalty` is None then.
-        vertices, faces, pieces: counts in the reconstruction; pieces are connected, crumbs among them.
-    """
-
-    cd: float | None
-    floor: float
-    excess: float | None
-    cd_source: float | None
-    point_to_surface: float | None
-    accuracy: float | None
-    accuracy_p95: float | None
-    completeness: float | None
+    cd: float | None  # mean squared nearest distance between samples, both directions added
+    floor: float  # `cd` of two independent samplings of the ground truth
+    excess: float | None  # cd - floor; below 0 by chance where a reconstruction is as good as the truth
+    cd_source: float | None  # `cd` in squared units of the source's own frame
+    point_to_surface: float | None  # mean of `accuracy` and `completeness`
+    accuracy: float | None  # mean distance from the reconstruction's samples to the true surface
+    accuracy_p95: float | None  # and its 95th percentile
+    completeness: float | None  # the same from the truth's samples to the reconstructed surface
     completeness_p95: float | None
-    normal_consistency: float | None
-    f_score: float | None
-    iou: float | None
-    cd_penalty: float
-    failed: bool
-    vertices: int
+    normal_consistency: float | None  # mean |n . n'| of nearest samples, both directions averaged, in [0, 1]
+    f_score: float | None  # harmonic mean of the shares of samples within tau of the other surface
+    iou: float | None  # volume of the intersection over that of the union; None unless both meshes are closed
+    cd_penalty: float  # `cd` of a single point at the origin, which stands for a failed reconstruction
+    failed: bool  # no surface: everything but `floor`, `cd_penalty` and the counts is None then
+    vertices: int  # of the reconstruction
     faces: int
-    pieces: int
+    pieces: int  # connected, crumbs among them
 
 
 def judge(
     reconstruction: Mesh, truth: NormalizedMesh, points: int = 30_000, seed: int = 0, tau: float = 0.01
 ) -> ShapeMetrics:
-    """All metrics of a reconstruction against the true mesh.
+    """All metrics of a reconstruction, normalised frame, against the true mesh, from `points` samples a side.
 
-    Args:
-        reconstruction: vertices [V, 3] and faces [F, 3], normalised frame; F = 0 is a failure.
-        truth: the mesh it should equal.
-        points: samples on each side.
-        seed: of all samples; the same seed gives the same judgement.
-        tau: threshold of the F-score, normalised frame.
+    The same seed gives the same judgement; tau is the threshold of the F-score, normalised frame.
     """
     mesh = Mesh(*map(np.ascontiguousarray, reconstruction, (np.float64, np.int64)))
     true_mesh = Mesh(truth.vertices, truth.faces)
-    expected = sample_surface(*true_mesh, points, (seed, 0))
+    expected, true_normals = sample_surface(*true_mesh, points, (seed, 0))
     values: dict[str, Any] = dict.fromkeys(field.name for field in fields(ShapeMetrics))
     values |= {
-        "floor": chamfer(expected[0], sample_surface(*true_mesh, points, (seed, 1))[0]),
-        "cd_penalty": chamfer(np.zeros((1, 3)), expected[0]),
+        "floor": chamfer(expected, sample_surface(*true_mesh, points, (seed, 1))[0]),
+        "cd_penalty": chamfer(np.zeros((1, 3)), expected),
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "pieces": piece_count(mesh.faces, len(mesh.vertices)),
         "failed": not np.abs(face_normals(*mesh)).sum() > 0,
     }
-    if not values["failed"]:
-        samples = sample_surface(*mesh, points, (seed, 2))
-        values |= _sampled_metrics(samples, expected)
-        values |= _surface_metrics(samples[0], mesh, expected[0], true_mesh, tau)
-        values["excess"] = values["cd"] - values["floor"]
-        values["cd_source"] = values["cd"] / float(truth.frame.scale) ** 2
-        values["iou"] = volumetric_iou(mesh, true_mesh, seed=seed)
+    if values["failed"]:
+        return ShapeMetrics(**values)
+    samples, normals = sample_surface(*mesh, points, (seed, 2))
+    (there, partner), (back, origin) = _nearest(samples, expected), _nearest(expected, samples)
+    pairs = (normals, true_normals[partner]), (true_normals, normals[origin])
+    cosines = [np.abs(np.einsum("ij,ij->i", *pair)).mean() for pair in pairs]
+    cd = float(np.mean(there**2) + np.mean(back**2))
+    values |= {"cd": cd, "excess": cd - values["floor"], "cd_source": cd / float(truth.frame.scale) ** 2}
+    values |= {"normal_consistency": float(np.mean(cosines)), "iou": volumetric_iou(mesh, true_mesh, seed)}
+    # exact distances of samples to the other surface have no noise floor
+    to_truth, to_mesh = point_to_surface(samples, *true_mesh), point_to_surface(expected, *mesh)
+    for name, distances in (("accuracy", to_truth), ("completeness", to_mesh)):
+        values |= {name: float(distances.mean()), f"{name}_p95": float(np.percentile(distances, 95))}
+    precision, recall = float(np.mean(to_truth < tau)), float(np.mean(to_mesh < tau))
+    values["point_to_surface"] = (values["accuracy"] + values["completeness"]) / 2
+    values["f_score"] = 2 * precision * recall / max(precision + recall, 1e-12)
     return ShapeMetrics(**values)
 
 
-@dataclass(frozen=True)
-class Judge:
-    """`judge` of a pair, with fixed `points` and `seed`; pickles for worker processes."""
-
-    points: int
-    seed: int
-
-    def __call__(self, pair: tuple[Mesh, NormalizedMesh]) -> ShapeMetrics:
-        return judge(*pair, points=self.points, seed=self.seed)
+def judge_pair(pair: tuple[Mesh, NormalizedMesh], points: int, seed: int) -> ShapeMetrics:
+    """`judge` of a reconstruction and its truth, for streams of such pairs."""
+    return judge(*pair, points, seed)
 
 
 def chamfer(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean squared nearest distance from a to b plus that from b to a.
+    """Mean squared nearest distance from points a [N, 3] to b [M, 3] plus that from b to a.
 
     Source: Fan et al., A Point Set Generation Network, 2017, with means for sums.
-
-    Args:
-        a, b: [N, 3] and [M, 3], N and M > 0, in the same frame.
     """
     return float(np.mean(_nearest(a, b)[0] ** 2) + np.mean(_nearest(b, a)[0] ** 2))
 
 
-def volumetric_iou(a: Mesh, b: Mesh, count: int = 20_000, seed: int = 0) -> float | None:
+def volumetric_iou(a: Mesh, b: Mesh, seed: int = 0, count: int = 20_000) -> float | None:
     """Volume inside both meshes over volume inside either, from `count` points in their joint bounding box.
 
-    A point is inside where the winding number is positive. None where a mesh is open, or both are empty.
+    A point is inside where the winding number is positive. None where a mesh is open.
 
     Source: Barill et al., Fast Winding Numbers for Soups and Clouds, 2018.
     """
@@ -143,20 +118,13 @@ def volumetric_iou(a: Mesh, b: Mesh, count: int = 20_000, seed: int = 0) -> floa
     low, high = corners.min(axis=0), corners.max(axis=0)
     points = np.random.default_rng(seed).uniform(low, high, (count, 3))
     points = points[morton_order(points)]
-    inside = []
-    for mesh in (a, b):
-        tree = igl.FastWindingNumberBVH()
-        tree.init(*mesh, 2)
-        inside.append(tree.winding_number(points, 2.0) > 0.5)  # to 0.01
-    union = np.count_nonzero(inside[0] | inside[1])
-    return float(np.count_nonzero(inside[0] & inside[1]) / union) if union else None
+    inside = [igl.fast_winding_number(*mesh, points) > 0.5 for mesh in (a, b)]
+    union = (inside[0] | inside[1]).sum()
+    return float((inside[0] & inside[1]).sum() / union) if union else None
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether every edge is used as often in one direction as in the other: winding numbers are whole then.
-
-    Vertices at the same place count as one.
-    """
+    """Whether every edge is used as often one way as the other, vertices at the same place counted as one."""
     if not len(faces) or _edges_cancel(faces):
         return bool(len(faces))
     _, place = np.unique(vertices, axis=0, return_inverse=True)
@@ -174,48 +142,17 @@ def _edges_cancel(faces: np.ndarray) -> bool:
 def summarize(rows: Sequence[ShapeMetrics]) -> dict[str, Any]:
     """Mean, median and 90th percentile of every metric over a set of shapes, failures counted beside them.
 
-    Returns:
-        `shapes`, `failed`, `failures` (how failures enter, in words), `cd_mean_with_failures` and
-        `cd_median_with_failures`, and per metric `mean`, `median` and `p90`, None where no shape has it, and
-        `count`, the number of shapes that have it.
+    `count` is the number of shapes that have a metric; its statistics are None where there is none.
     """
     with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
-    summary: dict[str, Any] = {"shapes": len(rows), "failed": sum(row.failed for row in rows)}
-    summary["failures"] = FAILURES
+    summary = {"shapes": len(rows), "failed": sum(row.failed for row in rows), "failures": FAILURES}
     for name in ("mean", "median"):
         summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
     for name in (field.name for field in fields(ShapeMetrics) if field.name not in ("failed", "cd_penalty")):
         values = [getattr(row, name) for row in rows if not row.failed and getattr(row, name) is not None]
-        summary[name] = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
-        summary[name]["count"] = len(values)
+        statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
+        summary[name] = statistics | {"count": len(values)}
     return summary
-
-
-def _sampled_metrics(samples: Sampled, expected: Sampled) -> dict[str, float]:
-    """Chamfer distance and normal consistency."""
-    to_expected, partner = _nearest(samples[0], expected[0])
-    to_samples, origin = _nearest(expected[0], samples[0])
-    pairs = (samples[1], expected[1][partner]), (expected[1], samples[1][origin])
-    cosines = [np.abs(np.einsum("ij,ij->i", *pair)).mean() for pair in pairs]
-    cd = np.mean(to_expected**2) + np.mean(to_samples**2)
-    return {"cd": float(cd), "normal_consistency": float(np.mean(cosines))}
-
-
-def _surface_metrics(
-    samples: np.ndarray, mesh: Mesh, expected: np.ndarray, truth: Mesh, tau: float
-) -> dict[str, float]:
-    """Metrics from exact distances of samples to the other surface: they have no noise floor."""
-    to_truth, to_mesh = point_to_surface(samples, *truth), point_to_surface(expected, *mesh)
-    precision, recall = float(np.mean(to_truth < tau)), float(np.mean(to_mesh < tau))
-    values = {
-        "point_to_surface": (to_truth.mean() + to_mesh.mean()) / 2,
-        "accuracy": to_truth.mean(),
-        "accuracy_p95": np.percentile(to_truth, 95),
-        "completeness": to_mesh.mean(),
-        "completeness_p95": np.percentile(to_mesh, 95),
-        "f_score": 2 * precision * recall / max(precision + recall, 1e-12),
-    }
-    return {name: float(value) for name, value in values.items()}
 
 
 def point_to_surface(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

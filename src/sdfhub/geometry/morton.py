@@ -2,16 +2,8 @@
 
 import numpy as np
 
-
-def _spread_bits() -> np.ndarray:
-    """[1024] the bits of each number with two zeros after each."""
-    code = np.arange(1024)
-    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        code = (code | code << shift) & mask
-    return code
-
-
-_SPREAD = _spread_bits()
+# the bits of each number below 1024 with two zeros after each: its binary digits, read in base 8
+_SPREAD = np.array([int(f"{code:b}", 8) for code in range(1024)])
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:

@@ -8,15 +8,14 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.geometry.sphere import sphere_directions
+from sdfhub.geometry.surface_sampling import sphere_directions
 from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.triangles import face_normals
 
 _CLAY = np.array([0.30, 0.46, 0.72])  # surface colour, linear RGB
 _CREASE = 38.0  # degrees; edges sharper than this stay sharp
 _SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
-_KEY = np.array([-0.45, -0.6, 0.95])
-_FILL = np.array([0.9, -0.25, 0.25])
+_FAR = 5.0  # of the camera from the origin
 
 
 def render(
@@ -28,50 +27,39 @@ def render(
     azimuth: float = -55.0,
     elevation: float = 24.0,
     background: float = 1.0,
-    occlusion_rays: int = 8,
 ) -> np.ndarray:
-    """A shaded picture of a mesh from a three-quarter view; both sides of its faces are lit.
+    """A shaded picture [size, size, 3] uint8 of a mesh from a three-quarter view, lit on both sides.
 
     Args:
-        vertices: [V, 3], within the unit ball.
-        faces: [F, 3] rows of `vertices`; F = 0 gives the background.
+        vertices, faces: [V, 3], within the unit ball, and [F, 3]; F = 0 gives the background.
         size: width and height in pixels.
         up: the axis of the mesh that points up; with "y" its front looks along +z, as is usual there.
         azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
         elevation: height of the camera above the horizon in degrees.
         background: sRGB grey level around the shape, in [0, 1].
-        occlusion_rays: rays to the sky per sample (four samples a pixel); 0 leaves the sky unoccluded.
-
-    Returns:
-        [size, size, 3] uint8, sRGB.
     """
     image = np.full((2 * size * 2 * size, 3), background**2.2)
     faces = np.asarray(faces)
     if len(faces):
         vertices = turned_up(np.asarray(vertices, dtype=np.float64), up, "z")
-        scene = EmbreeScene()
-        TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
-        origins, directions = _camera_rays(2 * size, azimuth, elevation)
-        hits = scene.run(origins, directions, query="INTERSECT", output=1)
+        a, e = np.radians([azimuth, elevation])
+        eye = _FAR * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right, half = np.array([-np.sin(a), np.cos(a), 0.0]), 1 / np.sqrt(_FAR**2 - 1)  # frames the unit ball
+        scene, rays, hits = seen_from(eye, right, half, 2 * size, vertices, faces)
         seen = np.flatnonzero(hits["primID"] >= 0)
-        points = origins[seen] + hits["tfar"][seen, None] * directions[seen]
-        normals, flat = _normals(vertices, faces, hits, seen, directions[seen])
+        points = eye + hits["tfar"][seen, None] * rays[seen]
+        normals, flat = _normals(vertices, faces, hits, seen, rays[seen])
         row, column = np.divmod(seen, 2 * size)
         subpixel = 2 * (row % 2) + column % 2  # which of its pixel's four samples a ray is
-        image[seen] = _CLAY * _light(scene, points, normals, flat, subpixel, occlusion_rays)
-    image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
+        image[seen] = _CLAY * _light(scene, (points + 2e-3 * flat).astype(np.float32), normals, subpixel)
+    image = image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))[::-1]
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
 
 
 def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
-    """A signed distance slice in colour: blue inside, orange outside, a line every delta / 4, zero black.
+    """A slice [R, R] of signed distances in colour [R, R, 3] uint8: blue inside, orange outside, zero black.
 
-    Args:
-        sdf_grid: [R, R], negative inside; the first index runs right, the second up.
-        delta: distance at which the colour saturates, > 0.
-
-    Returns:
-        [R, R, 3] uint8, sRGB.
+    Colours saturate at delta; there is a line every delta / 4. The first index runs right, the second up.
     """
     sdf = np.asarray(sdf_grid, dtype=np.float64).T[::-1]
     amount = np.clip(np.abs(sdf) / delta, 0, 1)[..., None]
@@ -90,19 +78,22 @@ def _changes(labels: np.ndarray) -> np.ndarray:
     return edge
 
 
-def _camera_rays(pixels: int, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Perspective rays, row by row from the top left, that frame the unit ball."""
-    a, e = np.radians([azimuth, elevation])
-    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    right = np.array([-np.sin(a), np.cos(a), 0.0])
-    distance = 5.0
-    half = 1.0 / np.sqrt(distance**2 - 1)  # tangent of the ball's half angle
-    steps = (np.arange(pixels) + 0.5) / pixels * 2 - 1
-    x, y = np.meshgrid(steps * half, -steps * half)
-    directions = x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(back, right) - back
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = np.broadcast_to(distance * back, directions.shape)
-    return origins.astype(np.float32), directions.astype(np.float32)
+def seen_from(
+    eye: np.ndarray, right: np.ndarray, half: float, pixels: int, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[EmbreeScene, np.ndarray, dict[str, np.ndarray]]:
+    """What a camera sees of a mesh: the scene, unit rays [pixels^2, 3] from the lowest row up, their hits.
+
+    It stands at `eye` [3] and looks at the origin; `half` is half the width of its picture at distance 1.
+    """
+    scene = EmbreeScene()
+    TriangleMesh(scene, vertices.astype(np.float32), faces.astype(np.int32))
+    forward = -eye / np.linalg.norm(eye)
+    steps = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * half
+    x, y = np.meshgrid(steps, steps)
+    rays = forward + x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(right, forward)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    origins = np.broadcast_to(eye.astype(np.float32), rays.shape).copy()
+    return scene, rays, scene.run(origins, rays, query="INTERSECT", output=1)
 
 
 def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.ndarray]:
@@ -117,38 +108,30 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
     return smooth * sign, flat * sign
 
 
-def _light(scene: EmbreeScene, points, normals, flat, subpixel, rays: int) -> np.ndarray:
-    """[N, 3] light at the points: a soft key and a sky dome, both with shadows, and a fill.
+def _lights() -> tuple[np.ndarray, np.ndarray]:
+    """Directions [L, 3] and colours [L, 3] of a soft key and of a sky dome, about 1 on a level plane."""
+    key = _unit(_unit(np.array([-0.45, -0.6, 0.95])) + 0.09 * sphere_directions(12))
+    dome = sphere_directions(32)
+    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
+    warm, cool = np.tile([1.0, 0.95, 0.87], (12, 1)) / 3, 0.2 * strength[:, None] * [0.88, 0.95, 1.0]
+    return np.concatenate([key, dome]), np.concatenate([warm, cool])
+
+
+def _light(scene: EmbreeScene, points: np.ndarray, normals: np.ndarray, subpixel: np.ndarray) -> np.ndarray:
+    """[N, 3] light at the points [N, 3], with shadows.
 
     The four samples of a pixel are lit by four interleaved sets of lights: their mean is smooth.
     """
-    start = (points + 2e-3 * flat).astype(np.float32)
-    around = _unit(_unit(_KEY) + 0.09 * sphere_directions(12))  # the key is an area light
-    key = np.sum([_lit(scene, start, normals, around[k + subpixel]) for k in (0, 4, 8)], axis=0) / 3
-    fill = np.clip(normals @ _unit(_FILL), 0, None)
-    sky = _sky(scene, start, normals, subpixel, rays) if rays else 0.5 + 0.5 * normals[:, 2]
-    warm, cool = np.array([1.0, 0.95, 0.87]), np.array([0.88, 0.95, 1.0])
-    return key[:, None] * warm + (0.04 * fill + 0.4 * sky)[:, None] * cool
-
-
-def _sky(scene: EmbreeScene, origins, normals, subpixel, rays: int) -> np.ndarray:
-    """[N] light from a dome of 4 * rays directions; about 1 for an open level plane."""
-    dome = sphere_directions(4 * rays)
-    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
-    total = np.zeros(len(origins))
-    for k in range(rays):
-        chosen = 4 * k + subpixel
-        total += strength[chosen] * _lit(scene, origins, normals, dome[chosen])
-    return 4 / rays * total
-
-
-def _lit(scene: EmbreeScene, origins: np.ndarray, normals: np.ndarray, lights: np.ndarray) -> np.ndarray:
-    """[N] cosine between the normal and the direction of the point's light, 0 where it is blocked."""
-    cosine = np.clip(np.einsum("ij,ij->i", normals, lights), 0, None)
-    facing = np.flatnonzero(cosine > 0)
-    hit = scene.run(origins[facing], lights[facing].astype(np.float32), query="OCCLUDED") >= 0
-    cosine[facing[hit]] = 0
-    return cosine
+    directions, colours = _lights()
+    total = np.zeros(points.shape)
+    for first in range(0, len(directions), 4):
+        lights = directions[first + subpixel]
+        cosine = np.clip(np.einsum("ij,ij->i", normals, lights), 0, None)
+        facing = np.flatnonzero(cosine > 0)
+        hit = scene.run(points[facing], lights[facing].astype(np.float32), query="OCCLUDED") >= 0
+        cosine[facing[hit]] = 0
+        total += colours[first + subpixel] * cosine[:, None]
+    return total
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

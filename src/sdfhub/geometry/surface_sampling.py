@@ -1,4 +1,4 @@
-"""Random points on a triangle mesh, uniform by area."""
+"""Points on surfaces: random ones on a triangle mesh, uniform by area, and even ones on the unit sphere."""
 
 import numpy as np
 
@@ -10,14 +10,7 @@ def sample_surface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Independent points [count, 3] on a mesh, and the unit normals [count, 3] of their faces, both float64.
 
-    Args:
-        vertices: [V, 3], any frame.
-        faces: [F, 3] rows of `vertices`.
-        count: points; those of a face come together.
-        seed: of the generator, or the generator itself.
-
-    Raises:
-        ValueError: the mesh has no area.
+    The points of a face come together. Raises ValueError for a mesh without area.
     """
     rng = np.random.default_rng(seed)
     normals = face_normals(vertices, faces)
@@ -27,11 +20,7 @@ def sample_surface(
 
 
 def random_faces(area: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """[count] rows of faces in ascending order, each drawn in proportion to its area of [F].
-
-    Raises:
-        ValueError: there is no area.
-    """
+    """[count] rows of faces in ascending order, each drawn in proportion to its area of [F]."""
     total = area.sum()
     if not total > 0:
         raise ValueError("faces: the mesh has no area to sample")
@@ -43,7 +32,13 @@ def points_on_faces(corners: np.ndarray, face: np.ndarray, rng: np.random.Genera
     root = np.sqrt(rng.random(len(face), corners.dtype))
     third = root * rng.random(len(face), corners.dtype)
     corner = corners[face]
-    points = (root - third)[:, None] * (corner[:, 1] - corner[:, 0])
-    points += third[:, None] * (corner[:, 2] - corner[:, 0])
-    points += corner[:, 0]
-    return points
+    edges = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return (root - third)[:, None] * edges[0] + third[:, None] * edges[1] + corner[:, 0]
+
+
+def sphere_directions(count: int) -> np.ndarray:
+    """[count, 3] unit vectors spread evenly (a Fibonacci lattice); neighbours lie far apart in the order."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - height**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)

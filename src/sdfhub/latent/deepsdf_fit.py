@@ -1,7 +1,6 @@
 """DeepSDF's published recipe for the codes of unseen shapes: one start, Adam, signed samples alone."""
 
 import math
-from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -13,8 +12,6 @@ from torch import Tensor
 from sdfhub.errors import SdfhubError
 from sdfhub.latent.fitting import Fitted, frozen
 from sdfhub.latent.problem import Rows, violation
-from sdfhub.latent.similarity import PoseRange
-from sdfhub.model.decoder import Decoder
 from sdfhub.model.losses import clamped_l1
 from sdfhub.shapes import Observation
 
@@ -27,41 +24,20 @@ class DeepSdfFit:
 
     Source: DeepSDF's published code: 800 steps, the learning rate divided by 10 halfway, z from
     N(0, 0.01^2), prior 1e-4 * mean z^2, 8000 samples a step.
-
-    Args:
-        steps: Adam steps.
-        lr: initial learning rate.
-        drop_at: share of the steps after which the learning rate is divided by 10.
-        per_step: samples a step and shape.
-        spread: standard deviation of the initial codes.
-        lambda_code: weight of the prior.
-        samples: signed samples that an observation of a stored shape should hold; None for all.
-        seed: of the initial code and the draws.
     """
 
     steps: PositiveInt = 800
     lr: PositiveFloat = 5e-3
-    drop_at: float = 0.5
-    per_step: Annotated[int, Field(ge=2)] = 8000
-    spread: NonNegativeFloat = 0.01
-    lambda_code: NonNegativeFloat = 1e-4
-    samples: PositiveInt | None = None
-    seed: NonNegativeInt = 0
+    drop_at: float = 0.5  # share of the steps after which the learning rate is divided by 10
+    per_step: Annotated[int, Field(ge=2)] = 8000  # samples a step and shape
+    spread: NonNegativeFloat = 0.01  # standard deviation of the initial codes
+    lambda_code: NonNegativeFloat = 1e-4  # weight of the prior
+    samples: PositiveInt | None = None  # that an observation of a stored shape should hold; None for all
+    seed: NonNegativeInt = 0  # of the initial code and the draws
 
     @torch.enable_grad()
-    def __call__(
-        self,
-        decoder: Decoder,
-        codes: Tensor,
-        observations: Sequence[Observation],
-        delta: float,
-        poses: PoseRange | None = None,
-    ) -> Fitted:
-        """As `Fit` says.
-
-        Raises:
-            SdfhubError: the frame is unknown, or a side has no bounds tight enough to be samples.
-        """
+    def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:
+        """As `Fit` says; refuses an unknown frame, and a side with no bounds tight enough to be samples."""
         if poses:
             raise SdfhubError("fit=deepsdf: finds no poses; use fit=gauss_newton")
         sides = [_signed_sides(observation) for observation in observations]
@@ -79,12 +55,11 @@ class DeepSdfFit:
                 optimizer.zero_grad()
                 (loss * len(sides)).backward()  # the mean over shapes would shrink their gradients
                 optimizer.step()
-            fitted = fitted.detach()
             with torch.no_grad():
                 rows = [Rows.of([observation], delta, [0], codes.device) for observation in observations]
                 pairs = zip(fitted.split(1), rows, strict=True)
                 residuals = [violation(decoder, code, row, delta).abs().mean(1) for code, row in pairs]
-        return Fitted(fitted, torch.cat(residuals))
+        return Fitted(fitted.detach(), torch.cat(residuals))
 
     def _drawn(self, sides: tuple[Tensor, Tensor], step: int) -> Tensor:
         """A step's samples [per_step, 4] of a shape."""

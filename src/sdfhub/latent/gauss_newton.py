@@ -1,7 +1,7 @@
 """Codes of observed shapes, and poses where these are unknown, by Gauss-Newton from several starts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, NamedTuple
 
 import torch
@@ -9,12 +9,11 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from sdfhub.latent.descent import Quadratic, descend
-from sdfhub.latent.fitting import Fitted, fit_groups, frozen
+from sdfhub.latent.fitting import Fitted, frozen
 from sdfhub.latent.gaussian import Gaussian
-from sdfhub.latent.problem import Prior, Problem, Rows, violation
-from sdfhub.latent.similarity import PoseRange, small_similarity
-from sdfhub.model.decoder import Decoder
+from sdfhub.latent.problem import Problem, Rows, violation
+from sdfhub.latent.similarity import Similarity, small_similarity
+from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.shapes import Observation
 
 ROWS_TOGETHER = 2**14  # rows of descents that are worked on together, or one shape's; bounds memory
@@ -22,12 +21,12 @@ CODES_TOGETHER = 64  # training codes compared at a time with an observation
 
 
 class Descents(NamedTuple):
-    """D states of descents: shapes [D], their turns [D], unknowns [D, U] and damping [D]."""
+    """States of D descents."""
 
-    shape: Tensor
-    turn: Tensor
-    unknowns: Tensor
-    damping: Tensor
+    shape: Tensor  # [D] number of its shape
+    turn: Tensor  # [D] row of the problem's turns
+    unknowns: Tensor  # [D, U]
+    damping: Tensor  # [D], in units of the Hessians' mean diagonals
 
 
 @dataclass(frozen=True)
@@ -39,80 +38,61 @@ class GaussNewtonFit:
     the observation. With an unknown pose: as many turns of it, each with the training code nearest then, the
     best ones. Signed samples have DeepSDF's prior, N(0, 1) in every direction; what scans leave open, the
     distribution of the training codes decides.
-
-    Args:
-        samples: signed samples that an observation of a stored shape should hold.
-        lambda_code: weight of DeepSDF's prior, mean z^2, for signed samples.
-        weight: of the distribution of the training codes, for scans.
-        weight_partial: the same for scans of only a part of the surface.
-        shrinkage: share of the isotropic covariance in that distribution: with less, few codes leave a
-            covariance that float32 cannot invert.
-        random: draws from that distribution to start from.
-        nearest: training codes to start from, by their violation on `probes` rows.
-        probes: rows that training codes, and turns of an unknown pose, are compared on.
-        thinning: starts see every so many-th row, the best of them then every root of it, then all.
-        steps: most steps of a descent.
-        tolerance: a descent ends when a step lowers its objective by a smaller share.
-        smallest: violation below which it counts squared, normalised frame; noise raises it.
-        blurred: the same while starts descend: a larger one leaves fewer minima to be caught in.
-        damping: of the first step, in units of the Hessian's mean diagonal.
-        seed: of the random draws.
     """
 
-    samples: PositiveInt = 16384
-    lambda_code: NonNegativeFloat = 1e-4
-    weight: NonNegativeFloat = 1e-4
-    weight_partial: NonNegativeFloat = 1e-3
+    samples: PositiveInt = 16384  # signed samples that an observation of a stored shape should hold
+    lambda_code: NonNegativeFloat = 1e-4  # weight of DeepSDF's prior, mean z^2, for signed samples
+    weight: NonNegativeFloat = 1e-4  # of the distribution of the training codes, for scans
+    weight_partial: NonNegativeFloat = 1e-3  # the same for scans of only a part of the surface
     shrinkage: Annotated[float, Field(ge=1e-4, le=1)] = 0.1
-    random: NonNegativeInt = 2
-    nearest: NonNegativeInt = 3
-    probes: PositiveInt = 256
-    thinning: PositiveInt = 16
-    steps: PositiveInt = 40
-    tolerance: float = 3e-3
-    smallest: PositiveFloat = 1e-3
-    blurred: PositiveFloat = 1e-2
-    damping: PositiveFloat = 10.0
-    seed: NonNegativeInt = 0
+    """Share of the isotropic covariance in that distribution; with less, few codes leave a singular one."""
+    random: NonNegativeInt = 2  # draws from that distribution to start from
+    nearest: NonNegativeInt = 3  # training codes to start from, by their violation on `probes` rows
+    probes: PositiveInt = 256  # rows that training codes, and turns of an unknown pose, are compared on
+    thinning: PositiveInt = 16  # starts see every so many-th row, the best every root of it, then all
+    steps: PositiveInt = 40  # at most, of a descent
+    tolerance: float = 3e-3  # a descent ends when a step lowers its objective by a smaller share
+    smallest: PositiveFloat = 1e-3  # violation below which it counts squared; noise raises it
+    blurred: PositiveFloat = 1e-2  # the same while starts descend: a larger one leaves fewer minima
+    damping: PositiveFloat = 10.0  # of the first step, in units of the Hessian's mean diagonal
+    seed: NonNegativeInt = 0  # of the random draws
 
     @torch.no_grad()
-    def __call__(
-        self,
-        decoder: Decoder,
-        codes: Tensor,
-        observations: Sequence[Observation],
-        delta: float,
-        poses: PoseRange | None = None,
-    ) -> Fitted:
+    def __call__(self, decoder, codes, observations, delta, poses=None) -> Fitted:
         """As `Fit` says."""
         likely = Gaussian.of(codes, self.shrinkage)
-        priors = [Prior(Gaussian.isotropic(codes[0]), self.lambda_code)]
-        priors += [Prior(likely, weight) for weight in (self.weight, self.weight_partial)]
+        priors = [(Gaussian.isotropic(codes[0]), self.lambda_code)]
+        priors += [(likely, weight) for weight in (self.weight, self.weight_partial)]
         blind = torch.cat([likely.mean[None], likely.sample(self.random, self.seed)])
         with frozen(decoder):
             problem = Problem(decoder, priors, delta, poses)
 
-            def fit(group: Sequence[Observation]) -> Fitted:
+            def fit(group: Sequence[Observation]) -> list[Tensor]:
                 prior = [0 if shape.is_exact else 1 + shape.partial for shape in group]
                 return self._fit(problem, codes, blind, Rows.of(group, self.smallest, prior, codes.device))
 
-            return fit_groups(fit, observations, codes.device)
+            fitted, residuals, *pose = in_groups(fit, observations, codes.device)
+        return Fitted(fitted, residuals, Similarity(*pose) if pose else None)
 
-    def _fit(self, problem: Problem, codes: Tensor, blind: Tensor, rows: Rows) -> Fitted:
-        """The fits of B shapes together: all starts on few rows, the best of each shape on more."""
+    def _fit(self, problem: Problem, codes: Tensor, blind: Tensor, rows: Rows) -> list[Tensor]:
+        """Codes, residuals and, where unknown, poses of B shapes: all starts on few rows, the best on all."""
         turn, unknowns = self._starts(problem, codes, blind, rows)  # [B, K], [B, K, U]
         shape = torch.arange(len(turn), device=turn.device)
         damping = torch.full(turn.shape, self.damping).to(unknowns).flatten()
-        starts = Descents(
-            shape.repeat_interleave(turn.shape[1]), turn.flatten(), unknowns.flatten(0, 1), damping
-        )
+        starts = shape.repeat_interleave(turn.shape[1]), turn.flatten(), unknowns.flatten(0, 1), damping
         blurred = rows._replace(soft=rows.soft.clamp(min=self.blurred))
-        ends, values = self._descend(problem, blurred, starts, self.thinning)
+        ends, values = self._descend(problem, blurred, Descents(*starts), self.thinning)
         best = values.reshape(turn.shape).argmin(1) + turn.shape[1] * shape
         ends = Descents(*(part[best] for part in ends))
         for every in sorted({math.isqrt(self.thinning), 1}, reverse=True):
             ends, _ = self._descend(problem, rows, ends, every)
-        return _fitted(problem, rows, ends)
+        turned, unknowns = rows.turned(problem.turns[ends.turn]), ends.unknowns
+        one_by_one = zip(map(turned.some, shape.split(1)), unknowns.split(1), strict=True)
+        residuals = torch.cat([problem.violation(*pair).abs().mean(1) for pair in one_by_one])
+        pose = small_similarity(unknowns[:, problem.size :]) if problem.has_pose else ()
+        if pose:
+            pose = pose._replace(rotation=pose.rotation @ problem.turns[ends.turn])
+        return [unknowns[:, : problem.size], residuals, *pose]
 
     def _starts(self, problem: Problem, codes: Tensor, blind: Tensor, rows: Rows) -> tuple[Tensor, Tensor]:
         """Turns [B, K] and unknowns [B, K, U] to descend from; `blind` codes are for every shape."""
@@ -139,30 +119,54 @@ class GaussNewtonFit:
         return least, codes[which]
 
     def _descend(self, problem: Problem, rows: Rows, starts: Descents, every: int) -> tuple[Descents, Tensor]:
-        """Where descents on every so many-th row end, and the objectives [D] there."""
+        """Where descents on every so many-th row end, and the objectives [D] there.
+
+        A step that does not lower the true objective is not taken, and the next is damped more.
+
+        Source: Levenberg 1944 and Marquardt 1963.
+        """
         size = max(1, ROWS_TOGETHER * every // rows.points.shape[1])
+        shape, turn, unknowns, damping = (part.clone() for part in starts)
 
-        def objective(which: Tensor, at: Tensor) -> Quadratic:
-            parts = [
-                problem.about(rows.some(starts.shape[part], every), starts.turn[part], there)
-                for part, there in zip(which.split(size), at.split(size), strict=True)
-            ]
-            return Quadratic(*(torch.cat(column) for column in zip(*parts, strict=True)))
+        def about(which: Tensor, at: Tensor) -> list[Tensor]:
+            parts = zip(which.split(size), at.split(size), strict=True)
+            about = [problem.about(rows.some(shape[part], every), turn[part], there) for part, there in parts]
+            return [torch.cat(column) for column in zip(*about, strict=True)]
 
-        unknowns, damping, values = descend(
-            objective, starts.unknowns, starts.damping, self.steps, self.tolerance
-        )
-        return starts._replace(unknowns=unknowns, damping=damping), values
+        left = torch.arange(len(shape), device=shape.device)  # descents that are not done
+        here = about(left, unknowns)
+        for _ in range(self.steps):
+            value, gradient, hessian = (part[left] for part in here)
+            mean = hessian.diagonal(dim1=1, dim2=2).mean(1)
+            damped = hessian + torch.diag_embed((damping[left] * mean)[:, None].expand_as(gradient))
+            # unlike solve, solve_ex lets what is no number pass
+            trial = unknowns[left] - torch.linalg.solve_ex(damped, gradient).result
+            there = about(left, trial)
+            gain = value - there[0]
+            lower = gain > 0  # false where there is no number
+            damping[left] = torch.where(lower, damping[left] * 0.3, damping[left] * 4).clamp(1e-5, 1e6)
+            better = left[lower]
+            for old, new in zip((unknowns, *here), (trial, *there), strict=True):
+                old[better] = new[lower]
+            left = left[~(lower & (gain < self.tolerance * value))]
+            if not len(left):
+                break
+        return Descents(shape, turn, unknowns, damping), here[0]
 
 
-def _fitted(problem: Problem, rows: Rows, ends: Descents) -> Fitted:
-    """Codes, residuals and poses of B shapes from the ends of their descents."""
-    residuals, poses = [], None
-    for shape in range(len(ends.shape)):
-        row = slice(shape, shape + 1)
-        out, _ = problem.violation_and_jacobian(rows.some(row), ends.turn[row], ends.unknowns[row])
-        residuals.append(out.abs().mean(1))
-    if problem.has_pose:
-        poses = small_similarity(ends.unknowns[:, problem.size :])
-        poses = poses._replace(rotation=poses.rotation @ problem.turns[ends.turn])
-    return Fitted(ends.unknowns[:, : problem.size], torch.cat(residuals), poses)
+def in_groups(
+    fit: Callable[[Sequence[Observation]], Sequence[Tensor]],
+    observations: Sequence[Observation],
+    device: torch.device,
+) -> list[Tensor]:
+    """What a fit finds of each observation: on a CPU one by one, elsewhere all of one size at once.
+
+    On a CPU each has a thread of its own, so that no neighbour changes even a rounding.
+    """
+    groups: dict[int, list[int]] = {}
+    for row, observation in enumerate(observations):
+        groups.setdefault(row if device.type == "cpu" else len(observation.points), []).append(row)
+    work = [[observations[row] for row in rows] for rows in groups.values()]
+    parts = side_by_side(fit, work, least=1) if device.type == "cpu" else map(fit, work)
+    order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
+    return [torch.cat(column)[order] for column in zip(*parts, strict=True)]

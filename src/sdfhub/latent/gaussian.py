@@ -10,28 +10,22 @@ from torch import Tensor
 class Gaussian:
     """A normal distribution of codes: z = mean + u axes + rest * w, all of u [K] and w [L] from N(0, 1).
 
-    Args:
-        mean: [L].
-        axes: [K, L], orthogonal, each one standard deviation long, the longest first. The entry of an axis
-            that is largest in size is positive, so that every machine finds the same axes.
-        rest: [] standard deviation in every direction besides, >= 0.
+    Axes are orthogonal, each one standard deviation long, the longest first. The entry of an axis that is
+    largest in size is positive, so that every machine finds the same axes.
     """
 
-    mean: Tensor
-    axes: Tensor
-    rest: Tensor
+    mean: Tensor  # [L]
+    axes: Tensor  # [K, L]
+    rest: Tensor  # [] standard deviation in every direction besides, >= 0
 
     @classmethod
     def of(cls, codes: Tensor, shrinkage: float = 0.0) -> "Gaussian":
         """The distribution of codes [S, L] by their principal components: K = min(S - 1, L) axes.
 
-        S codes know S - 1 directions at best; shrinkage gives the directions that they lack.
+        S codes know S - 1 directions at best; shrinkage in [0, 1], the share of the isotropic covariance (the
+        mean variance in all directions), gives those that they lack.
 
         Source: Ledoit and Wolf 2004, with a given share in place of their estimate.
-
-        Args:
-            codes: [S, L].
-            shrinkage: share of the isotropic covariance (the mean variance in all directions), in [0, 1].
 
         >>> codes = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [3.0, 1.0]])
         >>> Gaussian.of(codes).mean

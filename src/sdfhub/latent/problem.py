@@ -16,46 +16,36 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from sdfhub.latent.descent import Quadratic, values_and_jacobian
 from sdfhub.latent.gaussian import Gaussian
 from sdfhub.latent.similarity import SIZE, PoseRange, small_similarity, turns
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Observation
 
-
-class Prior(NamedTuple):
-    """A distribution of codes, and the weight that it has in the objective."""
-
-    codes: Gaussian
-    weight: float
+ROWS_AT_ONCE = 2**12  # rows differentiated at a time on a CPU, by each thread; bounds memory
 
 
 class Rows(NamedTuple):
-    """Bounded points of B shapes: points [B, N, 3], low, high and unsigned [B, N], soft and prior [B].
+    """Bounded points of B shapes, as in `Observation`."""
 
-    `soft` is the violation below which the objective is a parabola, normalised frame, > 0; `prior` the number
-    of the shape's prior in the problem.
-    """
-
-    points: Tensor
-    low: Tensor
-    high: Tensor
-    unsigned: Tensor
-    soft: Tensor
-    prior: Tensor
+    points: Tensor  # [B, N, 3]
+    low: Tensor  # [B, N]
+    high: Tensor  # [B, N]
+    unsigned: Tensor  # [B, N]
+    soft: Tensor  # [B] violation below which the objective is a parabola, normalised frame, > 0
+    prior: Tensor  # [B] number of the shape's prior in the problem
 
     @classmethod
     def of(
         cls, observations: Sequence[Observation], smallest: float, prior: Sequence[int], device: torch.device
     ) -> "Rows":
-        """B observations of equally many points as tensors; `soft` is their noise, at least `smallest`."""
+        """B observations of equally many points; `soft` is their noise, at least `smallest`."""
         names = ("points", "low", "high", "unsigned")
-        parts = [
-            torch.from_numpy(np.stack([getattr(shape, name) for shape in observations])) for name in names
-        ]
-        soft = torch.tensor([max(smallest, observation.noise) for observation in observations])
-        return cls(*(part.to(device) for part in (*parts, soft, torch.tensor(prior))))
+        parts = [np.stack([getattr(shape, name) for shape in observations]) for name in names]
+        soft = torch.tensor([max(smallest, shape.noise) for shape in observations])
+        rows = *map(torch.from_numpy, parts), soft, torch.tensor(prior)
+        return cls(*(part.to(device) for part in rows))
 
     def some(self, shapes: Tensor | slice, every: int = 1) -> "Rows":
         """Every so many-th row of some shapes."""
@@ -68,13 +58,9 @@ class Rows(NamedTuple):
 
 
 def violation(decoder: Decoder, codes: Tensor, rows: Rows, delta: float) -> Tensor:
-    """How far outside its bounds the clamped field is, signed: [B, N].
+    """How far outside its bounds the clamped field of codes [B, L] is, signed: [B, N].
 
-    Args:
-        decoder: in evaluation mode.
-        codes: [B, L].
-        rows: of B shapes, or of one for all codes.
-        delta: clamp of field and bounds.
+    Rows are of B shapes, or of one for all codes; the decoder is in evaluation mode.
     """
     field = decoder(rows.points.expand(len(codes), -1, -1), codes).clamp(-delta, delta)
     field = torch.where(rows.unsigned, field.abs(), field)
@@ -88,72 +74,72 @@ class Problem:
 
     Args:
         decoder: in evaluation mode.
-        priors: P of them; `Rows.prior` says which one a shape has.
+        priors: distributions of codes and their weights; `Rows.prior` says which one a shape has.
         delta: clamp of distances.
         poses: None where frames are known.
     """
 
-    def __init__(self, decoder: Decoder, priors: Sequence[Prior], delta: float, poses: PoseRange | None):
+    def __init__(
+        self,
+        decoder: Decoder,
+        priors: Sequence[tuple[Gaussian, float]],
+        delta: float,
+        poses: PoseRange | None,
+    ):
         self.decoder, self.delta, self.has_pose = decoder, delta, poses is not None
-        like = priors[0].codes.mean
+        like = priors[0][0].mean
         self.size = len(like)
-        self.turns = torch.eye(3).to(like)[None]
-        precisions = [torch.linalg.inv(prior.codes.covariance) for prior in priors]
+        self.turns = (turns(poses.turns, poses.up) if poses else torch.eye(3)[None]).to(like)
+        precisions = [torch.linalg.inv(codes.covariance) for codes, _ in priors]
         if poses:
-            self.turns = turns(poses.turns, poses.up).to(like)
-            narrow = torch.nn.functional.pad(poses.spread().to(like).pow(-2), (self.size, 0)).diag()
-            around = (0, SIZE, 0, SIZE)
-            precisions = [torch.nn.functional.pad(part, around) + narrow for part in precisions]
-        weighted = [prior.weight / self.size * part for prior, part in zip(priors, precisions, strict=True)]
-        self.center = torch.stack([self.unknowns(prior.codes.mean) for prior in priors])  # [P, U]
-        self.precision = torch.stack(weighted)  # [P, U, U]
+            narrow = pad(poses.spread().to(like).pow(-2), (self.size, 0)).diag()
+            precisions = [pad(part, (0, SIZE, 0, SIZE)) + narrow for part in precisions]
+        weights = [weight / self.size for _, weight in priors]
+        self.center = self.unknowns(torch.stack([codes.mean for codes, _ in priors]))  # [P, U]
+        self.precision = torch.stack([w * part for w, part in zip(weights, precisions, strict=True)])
 
     def unknowns(self, codes: Tensor) -> Tensor:
         """Unknowns [..., U] of codes [..., L] in the frame as it is."""
-        return torch.nn.functional.pad(codes, (0, SIZE)) if self.has_pose else codes
+        return pad(codes, (0, SIZE)) if self.has_pose else codes
 
-    def about(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> Quadratic:
-        """The objective of B shapes about unknowns [B, U].
+    def about(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The objective of B shapes, its gradient [B, U] and a positive definite Hessian [B, U, U].
 
         The absolute value of large violations enters as a reweighted square: |v| ~ v^2 / |v| with the weight
-        1 / max(|v|, soft) held during a step.
+        1 / max(|v|, soft) held during a step. `turn` [B] are rows of `turns`, unknowns are [B, U].
 
         Source: Holland and Welsch 1977 (reweighting).
-
-        Args:
-            rows: of the B shapes.
-            turn: [B] rows of `turns`.
-            unknowns: [B, U].
         """
-        out, jacobian = self.violation_and_jacobian(rows, turn, unknowns)
+        out, jacobian = self._jacobian(rows.turned(self.turns[turn]), unknowns)
         soft, size = rows.soft[:, None], out.abs()
         huber = torch.where(size < soft, size.square() / (2 * soft), size - soft / 2)
         weighted = (jacobian / torch.maximum(size, soft)[..., None] / out.shape[1]).mT
         precision, away = self.precision[rows.prior], unknowns - self.center[rows.prior]
         pull = (precision @ away[..., None]).squeeze(-1)
-        return Quadratic(
-            value=huber.mean(1) + (pull * away).sum(1),
-            gradient=(weighted @ out[..., None]).squeeze(-1) + 2 * pull,
-            hessian=weighted @ jacobian + 2 * precision,
-        )
+        gradient = (weighted @ out[..., None]).squeeze(-1) + 2 * pull
+        return huber.mean(1) + (pull * away).sum(1), gradient, weighted @ jacobian + 2 * precision
 
-    def violation_and_jacobian(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor]:
-        """Violations [B, N] and their derivatives by the unknowns [B, N, U]; arguments as in `about`.
+    def violation(self, rows: Rows, unknowns: Tensor) -> Tensor:
+        """Violations [B, N] of rows already turned, in the observations' units, by unknowns [B, U]."""
+        if not self.has_pose:
+            return violation(self.decoder, unknowns, rows, self.delta)
+        pose = small_similarity(unknowns[:, self.size :])
+        scale = pose.scale[:, None]
+        rows = rows._replace(points=pose.moved(rows.points), low=rows.low * scale, high=rows.high * scale)
+        return violation(self.decoder, unknowns[:, : self.size], rows, self.delta) / scale
 
-        Each row carries a copy of its shape's unknowns.
-        """
+    def _jacobian(self, rows: Rows, unknowns: Tensor) -> tuple[Tensor, Tensor]:
+        """Violations [B, N] and their derivatives [B, N, U], by one backward pass: each row has a copy of
+        its shape's unknowns."""
         shapes, count = rows.low.shape
-
-        def violation_of(copies: Tensor, *bounded: Tensor) -> Tensor:
-            single = Rows(*[*bounded, *rows[4:]])
-            if not self.has_pose:
-                return violation(self.decoder, copies, single, self.delta)[:, 0]
-            pose = small_similarity(copies[:, self.size :])
-            scale = pose.scale[:, None]
-            points, low, high = pose.moved(single.points), single.low * scale, single.high * scale
-            single = single._replace(points=points, low=low, high=high)
-            return (violation(self.decoder, copies[:, : self.size], single, self.delta) / scale)[:, 0]
-
-        inputs = (part.flatten(0, 1)[:, None] for part in rows.turned(self.turns[turn])[:4])
-        out, jacobian = values_and_jacobian(violation_of, unknowns.repeat_interleave(count, 0), *inputs)
+        size = ROWS_AT_ONCE if unknowns.is_cpu else shapes * count
+        copies = unknowns.repeat_interleave(count, 0).split(size)
+        singles = zip(*(part.flatten(0, 1)[:, None].split(size) for part in rows[:4]), strict=True)
+        pairs = []
+        for copy, single in zip(copies, singles, strict=True):
+            with torch.enable_grad():
+                copy = copy.detach().requires_grad_()
+                out = self.violation(Rows(*(*single, *rows[4:])), copy)[:, 0]
+                pairs.append((out.detach(), *torch.autograd.grad(out.sum(), copy)))
+        out, jacobian = (torch.cat(column) for column in zip(*pairs, strict=True))
         return out.reshape(shapes, count), jacobian.unflatten(0, (shapes, count))

@@ -13,11 +13,11 @@ AXES = {"y": 1, "z": 2}
 
 
 class Similarity(NamedTuple):
-    """B similarities: scale [B], > 0; rotation [B, 3, 3], orthogonal, determinant 1; shift [B, 3]."""
+    """B similarities."""
 
-    scale: Tensor
-    rotation: Tensor
-    shift: Tensor
+    scale: Tensor  # [B], > 0
+    rotation: Tensor  # [B, 3, 3], orthogonal, determinant 1
+    shift: Tensor  # [B, 3]
 
     def moved(self, points: Tensor) -> Tensor:
         """Images [B, N, 3] of points [B, N, 3]."""
@@ -25,10 +25,7 @@ class Similarity(NamedTuple):
 
 
 def small_similarity(numbers: Tensor) -> Similarity:
-    """The similarities that numbers [B, 7] describe; zeros are the identity. Differentiable everywhere.
-
-    Source: Rodrigues' formula.
-    """
+    """The similarities that numbers [B, 7] describe by Rodrigues' formula; zeros are the identity."""
     log_scale, turn, shift = numbers.split([1, 3, 3], dim=-1)
     x, y, z = turn.unbind(-1)
     none = torch.zeros_like(x)
@@ -48,20 +45,12 @@ def turns(count: int, up: str) -> Tensor:
 
 @dataclass(frozen=True)
 class PoseRange:
-    """How far an observation's frame may be from the normalised one, and from where the search starts.
+    """How far an observation's frame may be from the normalised one, and from where the search starts."""
 
-    Args:
-        turns: starts about the upright axis, evenly all around it: any turn about it is found.
-        tilt: of the upright axis, degrees.
-        scale: largest factor by which sizes may be wrong, either way.
-        shift: of the centre along an axis, normalised frame.
-        up: the axis that points up.
-    """
-
-    turns: PositiveInt
-    tilt: PositiveFloat
-    scale: Annotated[float, Field(gt=1)]
-    shift: PositiveFloat
+    turns: PositiveInt  # starts about the upright axis, evenly all around it: any turn about it is found
+    tilt: PositiveFloat  # of the upright axis, degrees
+    scale: Annotated[float, Field(gt=1)]  # largest factor by which sizes may be wrong, either way
+    shift: PositiveFloat  # of the centre along an axis, normalised frame
     up: Literal["y", "z"] = "z"
 
     def spread(self) -> Tensor:

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import torch
+from pydantic import PositiveFloat
 from torch import Tensor, nn
 
 from sdfhub.described import Described
@@ -64,12 +65,7 @@ class Elementwise(Activation):
 def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> Activation:
     """One layer's activation: a copy of a module, or what a class, partial or factory makes.
 
-    Args:
-        make: called with `first` where it takes such an argument.
-        first: whether it follows the layer that reads the encoded points.
-
-    Raises:
-        ValueError: it makes no module.
+    It is called with `first`, whether it is the first layer's, where it takes that.
     """
     if isinstance(make, nn.Module):
         activation = copy.deepcopy(make)
@@ -81,13 +77,6 @@ def new_activation(make: Callable[..., nn.Module] | nn.Module, first: bool) -> A
     if not isinstance(activation, nn.Module):
         raise ValueError(f"activation must make a torch.nn.Module, got {type(activation).__name__}")
     return activation if isinstance(activation, Activation) else Elementwise(activation, first)
-
-
-def require_positive(**values: float) -> None:
-    """Raises a ValueError that names an argument which is not a positive number."""
-    for name, value in values.items():
-        if isinstance(value, str) or not value > 0:
-            raise ValueError(f"{name} must be positive, got {value!r}")
 
 
 class Relu(Activation):
@@ -106,9 +95,8 @@ class Siren(Activation):
     Source: Sitzmann et al. 2020, section 3.2: first layer U(-1/n, 1/n), others U(+-sqrt(6/n) / omega).
     """
 
-    def __init__(self, omega_0: float, omega_hidden: float, first: bool = False):
+    def __init__(self, omega_0: PositiveFloat, omega_hidden: PositiveFloat, first: bool = False):
         super().__init__(first)
-        require_positive(omega_0=omega_0, omega_hidden=omega_hidden)
         self.omega = omega_0 if first else omega_hidden
 
     def weight_bound(self, fan_in: int) -> float:
@@ -140,10 +128,14 @@ class Hosc(Siren):
     """
 
     def __init__(
-        self, omega_0: float, omega_hidden: float, beta: float, learn_beta: bool = True, first: bool = False
+        self,
+        omega_0: PositiveFloat,
+        omega_hidden: PositiveFloat,
+        beta: PositiveFloat,
+        learn_beta: bool = True,
+        first: bool = False,
     ):
         super().__init__(omega_0, omega_hidden, first)
-        require_positive(beta=beta)
         self.log_beta = nn.Parameter(torch.tensor(math.log(beta)), requires_grad=learn_beta)
 
     @property
@@ -173,9 +165,10 @@ class Finer(Siren):
     Source: Liu et al. 2024 (FINER), and its published code for the first biases.
     """
 
-    def __init__(self, omega_0: float, omega_hidden: float, k: float, first: bool = False):
+    def __init__(
+        self, omega_0: PositiveFloat, omega_hidden: PositiveFloat, k: PositiveFloat, first: bool = False
+    ):
         super().__init__(omega_0, omega_hidden, first)
-        require_positive(k=k)
         self.k = k
 
     def bias_bound(self) -> float | None:
@@ -184,10 +177,7 @@ class Finer(Siren):
     def forward(self, x: Tensor) -> Tensor:
         return torch.sin(self.omega * (x.abs() + 1) * x)
 
-    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        size = x.abs()
-        angle = self.omega * (size + 1) * x
-        return torch.sin(angle), self.omega * (2 * size + 1) * torch.cos(angle)
+    with_slope = Activation.with_slope
 
 
 class Gauss(Activation):
@@ -196,17 +186,12 @@ class Gauss(Activation):
     Source: Ramasinghe and Lucey 2022, who find that the law of the initial weights matters little for it.
     """
 
-    def __init__(self, a: float, first: bool = False):
+    def __init__(self, a: PositiveFloat, first: bool = False):
         super().__init__(first)
-        require_positive(a=a)
         self.a = a
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.exp(-0.5 * (x / self.a).square())
-
-    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        bump = self(x)
-        return bump, -x / self.a**2 * bump
 
 
 class Wire(Siren):
@@ -218,17 +203,13 @@ class Wire(Siren):
     Source: Saragadam et al. 2023 (WIRE), and its published code.
     """
 
-    def __init__(self, omega_0: float, omega_hidden: float, s: float, first: bool = False):
+    def __init__(
+        self, omega_0: PositiveFloat, omega_hidden: PositiveFloat, s: PositiveFloat, first: bool = False
+    ):
         super().__init__(omega_0, omega_hidden, first)
-        require_positive(s=s)
         self.s = s
 
-    weight_bound = Activation.weight_bound
+    weight_bound, with_slope = Activation.weight_bound, Activation.with_slope
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cos(self.omega * x) * torch.exp(-(self.s * x).square())
-
-    def with_slope(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        angle, bump = self.omega * x, torch.exp(-(self.s * x).square())
-        wave = torch.cos(angle) * bump
-        return wave, -self.omega * torch.sin(angle) * bump - 2 * self.s**2 * x * wave

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -67,12 +67,7 @@ class AutoDecoder(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(
-        cls,
-        checkpoint_path: Any,
-        map_location: Any = "cpu",
-        *_: Any,
-        trust: str | Sequence[str] = (),
-        **__: Any,
+        cls, checkpoint_path: Any, map_location: Any = "cpu", *_, trust=(), **__
     ) -> Self:
         """The model of a checkpoint with its weights. Runs no code of the file.
 
@@ -80,9 +75,6 @@ class AutoDecoder(L.LightningModule):
             checkpoint_path: that a training wrote, such as RUN/checkpoints/last.ckpt.
             map_location: device of the weights.
             trust: packages beside sdfhub whose classes the checkpoint may name.
-
-        Raises:
-            SdfhubError: a damaged file, a class of another package, or weights of another model.
         """
         path = Path(checkpoint_path)
         content = read_checkpoint(path, map_location)
@@ -157,9 +149,7 @@ class AutoDecoder(L.LightningModule):
         optimizer, schedule = self.optim.configure(*weights, steps=int(self.steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def configure_gradient_clipping(
-        self, optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
-    ) -> None:
+    def configure_gradient_clipping(self, _, gradient_clip_val=None, gradient_clip_algorithm=None) -> None:
         # Lightning clips no gradients of a fused optimiser under mixed precision, for fear of a loss scale
         if gradient_clip_val is not None and gradient_clip_val > 0:
             by_value = gradient_clip_algorithm == "value"
@@ -177,11 +167,9 @@ class AutoDecoder(L.LightningModule):
         if torch.isfinite(torch.nn.utils.get_total_norm(parts.values())):
             return
         wrong = [name for name, part in parts.items() if not torch.isfinite(part).all()]
-        culprits = f"{', '.join(wrong[:3])}{' ...' * (len(wrong) > 3)}" if wrong else "its norm"
-        raise SdfhubError(
-            f"{what} is not finite at step {self.global_step} ({culprits}): the run diverged; "
-            "lower optim.lr_decoder, activation.omega_0, activation.beta or normals.tau"
-        )
+        where = f"at step {self.global_step} ({', '.join(wrong[:3]) or 'its norm'})"
+        hint = "lower optim.lr_decoder, activation.omega_0, activation.beta or normals.tau"
+        raise SdfhubError(f"{what} is not finite {where}: the run diverged; {hint}")
 
     def _log(self, batch: Batch, parts: dict[str, Tensor], loss: Tensor) -> None:
         values = {f"loss/{name}": float(part.detach()) for name, part in parts.items()}

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from sdfhub.described import Described
@@ -12,19 +13,11 @@ class CodeTable(Described, nn.Module):
     """Learned codes, started at N(0, 1 / L), so that their expected norm is 1.
 
     Source: Park et al. 2019, section 4.2; `max_norm` as in its published code.
-
-    Args:
-        shapes: S, number of rows.
-        size: L, numbers in a code.
-        max_norm: longer codes are shortened to it when they are read; None for no limit.
+    Codes [shapes, size] longer than `max_norm` are shortened to it when they are read.
     """
 
-    def __init__(self, shapes: int, size: int, max_norm: float | None = None):
+    def __init__(self, shapes: PositiveInt, size: PositiveInt, max_norm: PositiveFloat | None = None):
         super().__init__()
-        if shapes < 1 or size < 1:
-            raise ValueError(f"a code table needs shapes >= 1 and size >= 1, got {shapes} and {size}")
-        if max_norm is not None and max_norm <= 0:
-            raise ValueError(f"max_norm must be positive or null, got {max_norm}")
         self.max_norm = max_norm
         self.table = nn.Parameter(torch.randn(shapes, size) / math.sqrt(size))
 

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from sdfhub.described import Described
 from sdfhub.model.derivatives import value_and_pullback
 
+# of hidden [B, N, H] and of encoding [B, N, F]; None for a part that a layer does not read
 Cotangents = tuple[Tensor | None, Tensor | None]
-"""Of hidden [B, N, H] and of encoding [B, N, F]; None for a part that a layer does not read."""
 
 
 def full_precision(like: Tensor) -> AbstractContextManager:
-    """Keeps autocast, where there is any on the device of `like`, off what is computed inside."""
+    """Keeps autocast, if any on the device of `like`, off what is computed inside."""
     device = like.device.type
     # torch.export must write down every region, and cannot write one inside another
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
@@ -31,13 +31,10 @@ class Layer(Described, nn.Module, ABC):
     Args:
         hidden, encoding, code: columns H, F and L of each part; 0 leaves the part out.
         outputs: W, number of output features.
-
-    Attributes:
-        joins_code: whether the code's numbers are columns of `linear`, so that a layer before has to make
-            room for them where layers are shortened.
     """
 
     joins_code = False
+    """Whether codes are columns of `linear`, for which a layer before makes room where it is shortened."""
 
     def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
         super().__init__()
@@ -94,6 +91,7 @@ class Film(Concat):
     """
 
     joins_code = False
+    pullback = Layer.pullback
 
     def __init__(self, hidden: int, encoding: int, code: int, outputs: int):
         super().__init__(hidden, encoding, code, outputs)
@@ -103,16 +101,6 @@ class Film(Concat):
         product, bias = super().forward(inputs, codes)
         if self.film is None:
             return product, bias
-        scale, shift = self._scale_and_shift(self.film, codes)
-        return (product * scale).to(product.dtype), scale * bias + shift
-
-    def pullback(self, cotangent: Tensor, codes: Tensor) -> Cotangents:
-        if self.film is not None:
-            cotangent = cotangent * self._scale_and_shift(self.film, codes)[0]
-        return super().pullback(cotangent, codes)
-
-    @staticmethod
-    def _scale_and_shift(film: nn.Linear, codes: Tensor) -> tuple[Tensor, Tensor]:
         with full_precision(codes):  # one error here moves a whole shape
-            scale, shift = film(codes)[:, None].chunk(2, dim=-1)
-            return 1 + scale, shift
+            scale, shift = self.film(codes)[:, None].chunk(2, dim=-1)
+        return (product * (1 + scale)).to(product.dtype), (1 + scale) * bias + shift

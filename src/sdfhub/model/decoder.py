@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm as with_weight_norm
 
@@ -15,8 +16,7 @@ from sdfhub.model.dropout import dropout_factors
 from sdfhub.model.encodings import as_encoding
 from sdfhub.model.fast import waves
 
-HEAD_SPREAD = 0.03
-"""Standard deviation of the initial output for hidden units of size 1: well inside the clamp delta = 0.1."""
+HEAD_SPREAD = 0.03  # of the initial output for hidden units of size 1: well inside the clamp delta = 0.1
 
 
 def activated(
@@ -24,12 +24,7 @@ def activated(
 ) -> tuple[Tensor, Tensor | None]:
     """a(product + shift) and, where `sloped`, a'(product + shift), [B, N, W] with the dtype of `product`.
 
-    Args:
-        activation: a.
-        product: [B, N, W].
-        shift: [W] or [B, 1, W] float32.
-        dropout: probability in [0, 1) that a unit and its slope are 0; others are divided by 1 - dropout.
-        sloped: whether the slope is wanted; else it is None.
+    The shift is float32, [W] or [B, 1, W]; a unit that drops out has no slope either.
     """
     if not dropout and waves.fits(activation, product, shift):
         return waves.wave(activation, product, shift, sloped)
@@ -68,23 +63,18 @@ class Decoder(Described, nn.Module):
         self,
         encoding: nn.Module,
         activation: Callable[..., nn.Module],
-        code_size: int,
-        depth: int,
-        width: int,
+        code_size: PositiveInt,
+        depth: PositiveInt,
+        width: PositiveInt,
         inject_encoding: Sequence[int] = (),
         inject_code: Sequence[int] = (),
         shorten: bool = True,
         weight_norm: bool = True,
-        dropout: float = 0.0,
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0,
         tanh: bool = False,
         conditioning: type[Layer] | partial[Layer] = Concat,
     ):
         super().__init__()
-        if min(depth, width, code_size) < 1 or not 0 <= dropout < 1:
-            raise ValueError(
-                "depth, width and code_size must be at least 1, dropout in [0, 1); "
-                f"got {depth}, {width}, {code_size}, {dropout}"
-            )
         if not set(inject_encoding) | set(inject_code) <= set(range(1, depth + 1)):
             raise ValueError(f"inject_encoding and inject_code name layers 1 to {depth}")
         self.encoding, self.code_size = as_encoding(encoding), code_size
@@ -98,10 +88,8 @@ class Decoder(Described, nn.Module):
             after += code_size * (index + 1 in inject_code) * kind.joins_code
             outputs = 1 if index == depth else width - after * shorten
             if outputs < 1:
-                raise ValueError(
-                    f"width {width} leaves no room for {after} re-injected features; "
-                    "widen it, encode with fewer features, or set shorten=false"
-                )
+                hint = "widen it, encode with fewer features, or set shorten=false"
+                raise ValueError(f"width {width} leaves no room for {after} re-injected features; {hint}")
             encoded = features if index == 0 or index in inject_encoding else 0
             code = code_size if index == 0 or index in inject_code else 0
             layers.append(conditioning(hidden, encoded, code, outputs))
@@ -131,9 +119,7 @@ class Decoder(Described, nn.Module):
             encoded = self.encoding(points)
         return self._field(encoded, codes)[0]
 
-    def _field(
-        self, encoded: Tensor, codes: Tensor, sloped: bool = False
-    ) -> tuple[Tensor, list[Tensor | None]]:
+    def _field(self, encoded: Tensor, codes: Tensor, sloped=False) -> tuple[Tensor, list[Tensor | None]]:
         """Signed distances [B, N] and each hidden layer's slopes [B, N, W], where wanted, else None."""
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
@@ -152,10 +138,6 @@ class Decoder(Described, nn.Module):
 
         The chain rule is written out as one more pass through the layers, so that a loss of the gradient
         is differentiated once, like any other, and the whole compiles.
-
-        Args:
-            points: normalised frame.
-            codes: [B, L].
         """
         with full_precision(points):
             encoded, to_space = self.encoding.with_pullback(points)

@@ -5,20 +5,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-Pullback = Callable[[Tensor], Tensor]
-"""From a cotangent of a function's value to one of its argument."""
+Pullback = Callable[[Tensor], Tensor]  # from a cotangent of a function's value to one of its argument
 
 
 @torch.compiler.disable  # which cannot differentiate twice what it has compiled once
 def value_and_pullback(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Pullback]:
-    """f(x), and the map of a cotangent v, shaped like f(x), to J(x)^T v, shaped like x.
-
-    Both are differentiable where gradients are on, else plain numbers.
-
-    Args:
-        function: twice differentiable.
-        at: x, any shape.
-    """
+    """f(x), and the map of a cotangent v of f(x) to J(x)^T v; differentiable where gradients are on."""
     differentiable = torch.is_grad_enabled()
     with torch.inference_mode(False), torch.enable_grad():
         leaf = at if differentiable and at.requires_grad else at.detach().clone().requires_grad_()

@@ -7,25 +7,22 @@ the normal loss differentiates the field's spatial gradient by the weights. It m
 
 import math
 from abc import ABC, abstractmethod
+from typing import Annotated
 
 import torch
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from sdfhub.described import Described
 from sdfhub.model.derivatives import Pullback, value_and_pullback
 
-PRIMES = (1, 2_654_435_761, 805_459_861)
-"""Factors of the spatial hash. Source: Mueller et al. 2022, section 3."""
+PRIMES = (1, 2_654_435_761, 805_459_861)  # factors of the spatial hash: Mueller et al. 2022, section 3
 
 
 class Encoding(Described, nn.Module, ABC):
-    """A map from points to features.
+    """A map from points to features."""
 
-    Attributes:
-        features: F, the number of features of a point.
-    """
-
-    features: int
+    features: int  # F, the number of features of a point
 
     @abstractmethod
     def forward(self, points: Tensor) -> Tensor:
@@ -73,24 +70,24 @@ class Identity(Encoding):
         return points, lambda cotangent: cotangent
 
 
-class Waves(Encoding):
-    """sin and cos of A angles that are linear in x, after x itself where `include_points`: F = 2 A (+ 3)."""
+class Fourier(Encoding):
+    """sin(2^k pi x) and cos(2^k pi x) for k = 0 ... frequencies - 1, per axis: F = 6 frequencies (+ 3).
 
-    def __init__(self, angles: int, include_points: bool):
+    x itself comes first where `include_points`.
+
+    Source: Mildenhall et al. 2020, equation 4; the paper's "FFT".
+    """
+
+    octaves: Tensor
+
+    def __init__(self, frequencies: PositiveInt, include_points: bool = False):
         super().__init__()
         self.include_points = include_points
-        self.features = 2 * angles + 3 * include_points
-
-    @abstractmethod
-    def angles(self, points: Tensor) -> Tensor:
-        """[..., A] of points [..., 3]."""
-
-    @abstractmethod
-    def by_points(self, by_angles: Tensor) -> Tensor:
-        """The transpose of `angles`: [..., 3] of [..., A]."""
+        self.features = 6 * frequencies + 3 * include_points
+        self.register_buffer("octaves", math.pi * 2.0 ** torch.arange(frequencies), persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        angles = self.angles(points)
+        angles = (points[..., None] * self.octaves).flatten(-2)
         waves = [torch.sin(angles), torch.cos(angles)]
         return torch.cat([points, *waves] if self.include_points else waves, dim=-1)
 
@@ -101,34 +98,14 @@ class Waves(Encoding):
 
         def pullback(cotangent: Tensor) -> Tensor:
             by_sine, by_cosine = cotangent[..., first:].chunk(2, dim=-1)
-            by_points = self.by_points(by_sine * cosine - by_cosine * sine)
+            by_angles = by_sine * cosine - by_cosine * sine
+            by_points = by_angles.unflatten(-1, (3, -1)) @ self.octaves
             return by_points + cotangent[..., :3] if self.include_points else by_points
 
         return features, pullback
 
 
-class Fourier(Waves):
-    """sin(2^k pi x) and cos(2^k pi x) for k = 0 ... frequencies - 1, per axis: F = 6 frequencies (+ 3).
-
-    Source: Mildenhall et al. 2020, equation 4; the paper's "FFT".
-    """
-
-    octaves: Tensor
-
-    def __init__(self, frequencies: int, include_points: bool = False):
-        super().__init__(3 * frequencies, include_points)
-        if frequencies < 1:
-            raise ValueError(f"frequencies must be at least 1, got {frequencies}")
-        self.register_buffer("octaves", math.pi * 2.0 ** torch.arange(frequencies), persistent=False)
-
-    def angles(self, points: Tensor) -> Tensor:
-        return (points[..., None] * self.octaves).flatten(-2)
-
-    def by_points(self, by_angles: Tensor) -> Tensor:
-        return by_angles.unflatten(-1, (3, -1)) @ self.octaves
-
-
-class Gaussian(Waves):
+class Gaussian(Encoding):
     """sin(2 pi B x) and cos(2 pi B x) with rows of B drawn once from N(0, sigma^2): F = 2 rows.
 
     sigma is in cycles per unit of the normalised frame. B is a buffer: it is saved with the weights.
@@ -138,17 +115,14 @@ class Gaussian(Waves):
 
     directions: Tensor
 
-    def __init__(self, rows: int, sigma: float):
-        super().__init__(rows, include_points=False)
-        if rows < 1 or not sigma > 0:
-            raise ValueError(f"rows must be at least 1 and sigma positive, got {rows} and {sigma}")
+    def __init__(self, rows: PositiveInt, sigma: PositiveFloat):
+        super().__init__()
+        self.features = 2 * rows
         self.register_buffer("directions", torch.randn(rows, 3) * sigma)
 
-    def angles(self, points: Tensor) -> Tensor:
-        return 2 * math.pi * points @ self.directions.T
-
-    def by_points(self, by_angles: Tensor) -> Tensor:
-        return 2 * math.pi * by_angles @ self.directions
+    def forward(self, points: Tensor) -> Tensor:
+        angles = 2 * math.pi * points @ self.directions.T
+        return torch.cat([torch.sin(angles), torch.cos(angles)], dim=-1)
 
 
 class Hash(Encoding):
@@ -160,7 +134,7 @@ class Hash(Encoding):
     Source: Mueller et al. 2022, sections 3 and 3.1 ("smooth interpolation").
 
     Args:
-        levels: number of grids, >= 1.
+        levels: number of grids.
         width: features per level.
         log2_table: base-2 logarithm of the rows of a level's table.
         coarsest: cells along an axis of the first grid, over [-1, 1].
@@ -173,19 +147,16 @@ class Hash(Encoding):
 
     def __init__(
         self,
-        levels: int,
-        width: int,
-        log2_table: int,
-        coarsest: int,
-        finest: int,
+        levels: PositiveInt,
+        width: PositiveInt,
+        log2_table: Annotated[int, Field(ge=1, le=30)],
+        coarsest: PositiveInt,
+        finest: PositiveInt,
         include_points: bool = True,
     ):
         super().__init__()
-        if min(levels, width, coarsest) < 1 or finest < coarsest or not 1 <= log2_table <= 30:
-            raise ValueError(
-                "needs levels, width, coarsest >= 1, finest >= coarsest, 1 <= log2_table <= 30; "
-                f"got {levels}, {width}, {coarsest}, {finest}, {log2_table}"
-            )
+        if finest < coarsest:
+            raise ValueError(f"finest: must be at least {coarsest}, as coarsest is, not {finest}")
         growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
         cells = [round(coarsest * growth**level) for level in range(levels)]
         self.rows = [min((n + 1) ** 3, 2**log2_table) for n in cells]
@@ -217,15 +188,10 @@ class Hash(Encoding):
         return features, pullback
 
     def _encode(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-        """Features and what they are made of, for P points, K levels and C features a level.
+        """Features [..., F] and what they are made of, for P points, K levels and C features a level.
 
-        Points are the last axis: long rows are what a CPU is fast at.
-
-        Returns:
-            features: [..., F].
-            corners: [C, 2, 2, 2, K, P] table entries of the low and high corners in x, y and z.
-            blends: for x, y and z, [2, K, P] weights of the low and the high corner.
-            slope: [3, K, P] derivative of the high corner's weight by the point.
+        Table entries [C, 2, 2, 2, K, P] of the low and high corners in x, y and z; for each of these axes the
+        corners' weights [2, K, P]; slopes [3, K, P] of the high corner's. CPUs like points as the last axis.
         """
         position = (points.flatten(0, -2).T[:, None] + 1) / 2 * self.cells[:, None]
         low = position.detach().floor()

@@ -38,13 +38,10 @@ def normal_term(gradients: Tensor, normals: Tensor) -> Tensor:
 
 
 class Loss(Described):
-    """What a training lowers.
-
-    Attributes:
-        delta: half-width of the band in which distances count, > 0, also in fits of unseen shapes.
-    """
+    """What a training lowers."""
 
     delta: float = 0.1
+    """Half-width of the band in which distances count, > 0, also in fits of unseen shapes."""
 
     def wants_gradients(self, progress: float) -> bool:
         """Whether spatial gradients are given at this share of training, in [0, 1]; they cost time."""
@@ -84,35 +81,19 @@ class SdfLoss(Loss):
     """Clamped L1 + lambda_code * prior of the codes + tau * normal term.
 
     Sums over points in the paper are means here, so that weights do not depend on the batch.
-
-    Args:
-        delta: clamp of signed distances, normalised frame, > 0.
-        lambda_code: weight of the code prior, >= 0.
-        code_norm: `squared` for |z|^2 or `l2` for |z|.
-        warmup: share of training over which lambda_code grows linearly from 0.
-        tau: weight of the normal term, >= 0; 0 switches it off.
-        tau_start: share of training before which tau is 0: normals cost time before they pay.
     """
 
-    delta: PositiveFloat = 0.1
-    lambda_code: NonNegativeFloat = 1e-4
-    code_norm: Literal["squared", "l2"] = "squared"
-    warmup: Share = 0.05
-    tau: NonNegativeFloat = 0.01
-    tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    delta: PositiveFloat = 0.1  # clamp of signed distances, normalised frame
+    lambda_code: NonNegativeFloat = 1e-4  # weight of the code prior
+    code_norm: Literal["squared", "l2"] = "squared"  # |z|^2 or |z|
+    warmup: Share = 0.05  # share of training over which lambda_code grows linearly from 0
+    tau: NonNegativeFloat = 0.01  # weight of the normal term; 0 switches it off
+    tau_start: Annotated[float, Field(ge=0, lt=1)] = 0.0  # share of training before which tau is 0
 
     def wants_gradients(self, progress: float) -> bool:
         return self.tau > 0 and progress >= self.tau_start
 
-    def parts(
-        self,
-        predicted: Tensor,
-        target: Tensor,
-        codes: Tensor,
-        gradients: Tensor | None,
-        normals: Tensor | None,
-        progress: float,
-    ) -> dict[str, Tensor]:
+    def parts(self, predicted, target, codes, gradients, normals, progress) -> dict[str, Tensor]:
         """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
         parts = {"sdf": clamped_l1(predicted, target, self.delta)}

@@ -12,8 +12,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat
 from pydantic.dataclasses import dataclass
 from torch import nn
 
-Schedule = Callable[[float], float]
-"""A factor of every learning rate as a function of the share of training done, in [0, 1]."""
+Schedule = Callable[[float], float]  # from the share of training done to a factor of learning rates
 
 
 @dataclass(frozen=True)
@@ -45,29 +44,19 @@ class Cosine:
 class Optimisation:
     """An optimiser over the decoder's weights and the codes, each with its own learning rate.
 
-    Args:
-        lr_decoder: initial learning rate of the decoder, > 0.
-        lr_codes: initial learning rate of the codes, > 0.
-        schedule: factor of both over the share of training; None keeps them.
-        warmup_steps: over which both first rise from 0; no more than half of training. Without, the first
-            steps of a training, short or long, throw the field out of [-delta, delta], where the clamped
-            loss has no gradient.
-        optimizer: a class of `torch.optim` or a partial of one; fused where it can be.
+    Without a warm-up the first steps throw the field out of [-delta, delta], where the clamped loss is flat.
     """
 
     lr_decoder: PositiveFloat = 2e-3
     lr_codes: PositiveFloat = 5e-3
-    schedule: Schedule | None = None
-    warmup_steps: NonNegativeInt = 0
-    optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam
+    schedule: Schedule | None = None  # factor of both rates over the share of training
+    warmup_steps: NonNegativeInt = 0  # over which both rates rise from 0; at most half of training
+    optimizer: Callable[..., torch.optim.Optimizer] = torch.optim.Adam  # or a partial; fused where it can be
 
     @classmethod
     def of(cls, make: Any) -> "Optimisation":
-        """An optimisation itself, or that of a partial of this class or of an optimiser.
-
-        An optimiser's, such as `partial(torch.optim.AdamW, lr_decoder=1e-3, weight_decay=0.01)`, may have
-        keywords of this class too; its `lr` stands for a rate that is not given.
-        """
+        """An optimisation itself, or that of a partial of this class or of an optimiser, which may have
+        keywords of this class too; its `lr` stands for a rate that is not given."""
         if hasattr(make, "configure"):
             return make
         if make.func is cls:

@@ -15,17 +15,13 @@ from sdfhub.model.decoder import Decoder
 
 Model = TypeVar("Model", bound=nn.Module)
 
-PARTS = {"decoder": "sdfhub.model", "codes": "sdfhub.model", "loss": "sdfhub.model", "optim": "sdfhub.model"}
-PARTS |= {"computing": "sdfhub.model", "validation": "sdfhub"}
+PARTS = dict.fromkeys(("decoder", "codes", "loss", "optim", "computing"), "sdfhub.model")
+PARTS |= {"validation": "sdfhub"}
 """Descriptions among the hyper-parameters of a checkpoint, and where their classes live."""
 
 
 def built_parts(parameters: Any, path: Path, trust: str | Sequence[str] = ()) -> dict[str, Any]:
-    """The constructor's arguments of an auto-decoder, from the hyper-parameters of a checkpoint.
-
-    Raises:
-        SdfhubError: they describe none, or name a class of a package that is not trusted.
-    """
+    """The constructor's arguments of an auto-decoder, from the hyper-parameters of a checkpoint."""
     if not isinstance(parameters, Mapping) or not {"decoder", "shapes"} <= parameters.keys():
         raise SdfhubError(f"{path}: describes no auto-decoder; give a checkpoint that a training wrote")
     parts = {name: built(parameters.get(name), name, trust, within) for name, within in PARTS.items()}
@@ -35,11 +31,7 @@ def built_parts(parameters: Any, path: Path, trust: str | Sequence[str] = ()) ->
 def saved_decoder(
     description: Any, weights: Mapping[str, Tensor], path: Path, trust: str | Sequence[str] = ()
 ) -> Decoder:
-    """The decoder of a plain description with its `state_dict`, in evaluation mode and without gradients.
-
-    Raises:
-        SdfhubError: the weights are those of another decoder, or a class is of a package not in `trust`.
-    """
+    """The decoder of a plain description with its `state_dict`, in evaluation mode and without gradients."""
     make = partial(built, description, "decoder", trust, within="sdfhub.model")
     return model_with_weights(make, description, weights, path).eval().requires_grad_(False)
 
@@ -48,9 +40,6 @@ def model_with_weights(make: Callable[[], Model], description: Any, weights: Any
     """The model that `make` makes of a description, with its `state_dict`.
 
     Nothing is made that is larger than the weights: a few bytes of description could ask for any size.
-
-    Raises:
-        SdfhubError: the description is none, or that of another model; names the file.
     """
     if not isinstance(weights, Mapping) or not all(
         isinstance(weight, Tensor) and weight.is_contiguous() for weight in weights.values()
@@ -63,16 +52,13 @@ def model_with_weights(make: Callable[[], Model], description: Any, weights: Any
             raise SdfhubError(f"{path}: {value} is more than a decoder of {size} weights can have")
     try:
         with torch.device("meta"):
-            expected = make().state_dict()
-        for name in sorted(expected.keys() | weights.keys()):
-            wanted, got = (list(part[name].shape) if name in part else "none" for part in (expected, weights))
-            if wanted != got:
-                raise SdfhubError(f"holds another model than it describes: {name}: {got}, not {wanted}")
+            make().load_state_dict(weights, assign=True)  # refuses other names and shapes
         with torch.random.fork_rng(devices=[]):  # initial weights are drawn, though only to be replaced
             model = make()
         model.load_state_dict(weights)
     except SdfhubError as error:
         raise SdfhubError(f"{path}: {error}") from error
     except (RuntimeError, TypeError, AttributeError, ArithmeticError) as error:
-        raise SdfhubError(f"{path}: describes no model: {error}") from error
+        reason = " ".join(str(error).split())[:200]
+        raise SdfhubError(f"{path}: holds another model than it describes: {reason}") from error
     return model

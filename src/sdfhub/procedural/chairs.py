@@ -8,8 +8,6 @@ from manifold3d import Manifold
 from sdfhub.procedural import chair_backs, parts
 from sdfhub.procedural.parameters import choice, continuous
 
-_FOUR_LEGS = ("square", "turned", "round")
-
 
 @dataclass(frozen=True)
 class Chair:
@@ -64,10 +62,8 @@ class Chair:
         return parts.pad(self.outline(), bottom, top, 0.4 * self.seat_thickness)
 
     def _base(self) -> list[Manifold]:
-        if self.legs in _FOUR_LEGS:
-            return self._four_legs()
         bases = dict(sled=self._sled, cantilever=self._cantilever, star=self._star, tulip=self._tulip)
-        return bases[self.legs]()
+        return bases.get(self.legs, self._four_legs)()
 
     def _leg_ends(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """(top, foot) of the four legs: front left, front right, back left, back right."""

@@ -4,6 +4,7 @@ import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import parts
+from sdfhub.procedural.parts import rod
 
 _THIRDS = parts.spokes(3, 0.5)
 
@@ -24,16 +25,12 @@ def head(lamp, hung: bool) -> Manifold:
     return parts.union(build(lamp, tall, gauge, hung))
 
 
-def _rod(bottom: float, top: float, radius: float) -> Manifold:
-    return parts.lathe([(radius, bottom), (radius, top)], 14)
-
-
 def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold]:
     """A bulb and its socket; `up` tells on which side of the socket the bulb is."""
     sign = 1 if up else -1
     low, high = sorted([centre, centre - sign * 1.75 * radius])
     socket = max(0.55 * radius, 1.5 * gauge)
-    return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), _rod(low, high, socket)]
+    return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), rod(low, high, socket)]
 
 
 def _radius(lamp, share: np.ndarray) -> np.ndarray:
@@ -74,20 +71,20 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     at = 0.9
     made = [shell, *_spider(lamp, tall, at, gauge)]
     if hung:
-        return [*made, *_bulb(0.45 * tall, size, gauge, False), _rod(0.5 * tall, tall + 2 * gauge, gauge)]
+        return [*made, *_bulb(0.45 * tall, size, gauge, False), rod(0.5 * tall, tall + 2 * gauge, gauge)]
     made += _bulb(0.42 * tall, size, gauge, True)
     if lamp.fitting == "harp":
         made += _harp(tall, at, gauge, 1.45 * size)
-        made.append(_rod(-2 * gauge, 0.42 * tall, gauge))
+        made.append(rod(-2 * gauge, 0.42 * tall, gauge))
     else:
-        made.append(_rod(-2 * gauge, at * tall, gauge))
+        made.append(rod(-2 * gauge, at * tall, gauge))
     if lamp.fitting == "rings":
         made += _spider(lamp, tall, 0.08, gauge)
     if lamp.finial:
         top, knob = at * tall, max(at * tall + 4 * gauge, tall)
-        made.append(_rod(top - gauge, top + 3 * gauge, 0.9 * gauge))
+        made.append(rod(top - gauge, top + 3 * gauge, 0.9 * gauge))
         made.append(parts.ellipsoid((1.9 * gauge, 1.9 * gauge, 2.3 * gauge), (0, 0, knob), 16))
-        made.append(_rod(top, knob, 0.9 * gauge))
+        made.append(rod(top, knob, 0.9 * gauge))
     return made
 
 
@@ -95,7 +92,7 @@ def _spider(lamp, tall: float, share: float, gauge: float) -> list[Manifold]:
     reach, z = float(_radius(lamp, np.array(share))), share * tall
     reach *= 1 - (0.9 / lamp.pleats if lamp.shade == "pleated" else 0.0)
     wires = [parts.bar((0, 0, z), reach * out + [0, 0, z], 0.8 * gauge) for out in _THIRDS]
-    return [*wires, _rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]
+    return [*wires, rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]
 
 
 def _harp(tall: float, share: float, gauge: float, wide: float) -> list[Manifold]:
@@ -117,9 +114,9 @@ def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     crown = [(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)]
     made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40), parts.lathe(crown)]
     if hung:
-        made += [*_bulb(0.42 * tall, size, gauge, False), _rod(0.42 * tall, tall + 4 * gauge, gauge)]
+        made += [*_bulb(0.42 * tall, size, gauge, False), rod(0.42 * tall, tall + 4 * gauge, gauge)]
     else:
-        made += [*_bulb(0.4 * tall, size, gauge, True), _rod(-2 * gauge, tall, gauge)]
+        made += [*_bulb(0.4 * tall, size, gauge, True), rod(-2 * gauge, tall, gauge)]
     return made
 
 
@@ -132,7 +129,7 @@ def _globe(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     lift = 0.6 * gauge
     made = [parts.revolve_shell(profile, lamp.wall_thickness(), 36)]
     made.append(parts.lathe([(0.9 * gauge, -3 * gauge), (cap, -1.5 * gauge), (1.2 * cap, 2.4 * gauge)]))
-    made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, True), _rod(-3.5 * gauge, 0.4 * tall, gauge)]
+    made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, True), rod(-3.5 * gauge, 0.4 * tall, gauge)]
     ball = parts.union(made).translate((0, 0, lift))
     return [ball.rotate((180, 0, 0)).translate((0, 0, tall))] if hung else [ball]
 
@@ -146,14 +143,14 @@ def _bowl(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     size = min(0.3 * wide, 0.3 * tall)
     made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
     made.append(parts.lathe([(gauge, -3 * gauge), (1.2 * cap, -gauge), (1.3 * cap, 2 * gauge)]))
-    made.append(_rod(0, 0.5 * tall, gauge))
+    made.append(rod(0, 0.5 * tall, gauge))
     made += _bulb(0.5 * tall, size, gauge, True)
     if not hung:
-        return [*made, _rod(-4 * gauge, 0, gauge)]
+        return [*made, rod(-4 * gauge, 0, gauge)]
     apex = tall + 1.1 * wide
     for out in _THIRDS:
         made.append(parts.bar(0.97 * wide * out + [0, 0, 0.97 * tall], (0, 0, apex), 0.8 * gauge))
-    return [*made, parts.ellipsoid((2 * gauge,) * 3, (0, 0, apex), 16), _rod(apex, apex + 3 * gauge, gauge)]
+    return [*made, parts.ellipsoid((2 * gauge,) * 3, (0, 0, apex), 16), rod(apex, apex + 3 * gauge, gauge)]
 
 
 def top(lamp) -> float:

@@ -70,18 +70,15 @@ class Lamp:
     def _foot(self) -> float:
         return _BASE[self.kind] * self.base_width * self.tall() / 2
 
-    def _rod(self, bottom: float, top: float, radius: float) -> Manifold:
-        return parts.lathe([(radius, bottom), (radius, top)], 16)
-
     def _upright(self) -> list[Manifold]:
         """A floor or table lamp: base, body, stem and a shade on top."""
         low, g = self.tall() - lamp_shades.height(self), self.gauge()
         made = [lamp_shades.head(self, hung=False).translate((0, 0, low))]
         if self.base in ("disc", "cube", "feet"):
-            made += [*self._plinth(), self._rod(0.4 * self.base_height, low, 1.25 * g)]
+            made += [*self._plinth(), parts.rod(0.4 * self.base_height, low, 1.25 * g, 16)]
         else:
             made.append(self._body(0.93 * low if self.kind == "table" else 0.4 * low))
-            made.append(self._rod(0.02, low, 1.25 * g))
+            made.append(parts.rod(0.02, low, 1.25 * g, 16))
         if self.collar:
             made.append(parts.ellipsoid((2.4 * g, 2.4 * g, 1.6 * g), (0, 0, 0.93 * low), 18))
         return made
@@ -92,7 +89,7 @@ class Lamp:
         if self.base == "cube":
             return [parts.rounded_box((1.7 * r, 1.7 * r, 1.5 * h), (0, 0, 0.75 * h), 0.1 * h)]
         if self.base == "feet" and self.kind != "arc":
-            made = [self._rod(0.5 * r, 0.9 * r, 2.2 * g)]
+            made = [parts.rod(0.5 * r, 0.9 * r, 2.2 * g, 16)]
             for way in parts.spokes(3):
                 start, end = 0.8 * r * np.array([0, 0, 1]), 1.25 * r * way + [0, 0, 1.3 * g]
                 path = parts.arc(start, end, 0.22 * r * (way + [0, 0, 1]))
@@ -129,12 +126,7 @@ class Lamp:
         end = np.array([0, -self.reach * 0.8 * tall, 0.86 * tall])
         made = self._plinth_or_block()
         if self.arm == "bent":
-            corners: list[parts.Point] = [
-                start,
-                start + [0, 0.02, 0.6 * tall],
-                (0, 0.5 * end[1], 1.12 * tall),
-                end,
-            ]
+            corners = np.array([start, start + [0, 0.02, 0.6 * tall], (0, 0.5 * end[1], 1.12 * tall), end])
             made.append(parts.tube(parts.filleted(corners, 0.16 * tall, 8), 1.2 * g, up=(1, 0, 0)))
         else:
             offsets = (-1.9 * g, 1.9 * g) if self.arm == "paired" else (0.0,)
@@ -194,13 +186,13 @@ class Lamp:
         end = lamp_shades.top(self)
         canopy = [(1.4 * g, tall - 0.05), (0.9 * r, tall - 0.035), (r, tall - 0.02), (r, tall)]
         if self.lights == 1:
-            return [hung, parts.lathe(canopy, 32), self._rod(end - 3 * g, tall - 0.01, g)]
+            return [hung, parts.lathe(canopy, 32), parts.rod(end - 3 * g, tall - 0.01, g, 16)]
         step = 1.25 * self.shade_diameter()
         rail = parts.rounded_box((2.3 * step, 0.8 * r, 0.03), (0, 0, tall - 0.015), 0.008)
         made = [rail]
         for place, lift in zip((-step, 0, step), (0, 0.2 * (self.elbow - 0.4) * tall, 0), strict=True):
             made.append(hung.translate((place, 0, 2 * lift)))
-            made.append(self._rod(end + 2 * lift - 3 * g, tall - 0.01, g).translate((place, 0, 0)))
+            made.append(parts.rod(end + 2 * lift - 3 * g, tall - 0.01, g, 16).translate((place, 0, 0)))
         return made
 
 

@@ -22,9 +22,7 @@ def draw(design: type, rng: np.random.Generator):
     """One design with every field drawn in the order of declaration."""
     values = {}
     for f in fields(design):
-        if "range" in f.metadata:
-            values[f.name] = float(rng.uniform(*f.metadata["range"]))
-        else:
-            options = f.metadata["options"]
-            values[f.name] = options[int(rng.integers(len(options)))]
+        options = f.metadata.get("options", ())
+        number = rng.integers(len(options)) if options else rng.uniform(*f.metadata["range"])
+        values[f.name] = options[int(number)] if options else float(number)
     return design(**values)

@@ -10,16 +10,18 @@ from functools import lru_cache
 import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
 
-Point = Sequence[float] | np.ndarray
-"""x, y, z."""
-
-Profile = Sequence[tuple[float, float]] | np.ndarray
-"""(radius, height) of a turned part."""
+Point = Sequence[float] | np.ndarray  # x, y, z
+Profile = Sequence[tuple[float, float]] | np.ndarray  # (radius, height) of a turned part
 
 
 def union(parts: Sequence[Manifold]) -> Manifold:
     """The solid covered by any of the parts (exact boolean)."""
     return Manifold.batch_boolean(list(parts), OpType.Add)
+
+
+def rod(bottom: float, top: float, radius: float, segments: int = 14) -> Manifold:
+    """An upright round bar on the axis z."""
+    return lathe([(radius, bottom), (radius, top)], segments)
 
 
 def box(size: Point, centre: Point) -> Manifold:
@@ -28,10 +30,7 @@ def box(size: Point, centre: Point) -> Manifold:
 
 
 def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Manifold:
-    """A box of full extents `size` whose edges and corners have one radius: a cushion, a padded arm.
-
-    The radius is cut to half the thinnest extent; a quarter of a circle has `steps` facets.
-    """
+    """A box of full extents `size` with rounded edges and corners, `steps` facets a quarter of a circle."""
     half = np.asarray(size, float) / 2
     r = min(radius, 0.98 * half.min())
     theta = np.linspace(0, np.pi / 2, steps + 1)
@@ -42,10 +41,7 @@ def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Ma
 
 
 def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: int = 3) -> Manifold:
-    """A convex outline [N, 2] extruded with rounded rims: a seat, a table top, a cushion.
-
-    The radius of the rims is below half the outline's width, 0 keeps them sharp; `steps` as in `rounded_box`.
-    """
+    """A convex outline [N, 2] extruded with rounded rims; their radius is below half the outline's width."""
     r = min(radius, 0.49 * (top - bottom))
     if r <= 0:
         return prism(outline, bottom, top)
@@ -66,11 +62,7 @@ def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
 
 
 def loft(sections: np.ndarray) -> Manifold:
-    """The solid through closed sections, with flat ends.
-
-    Args:
-        sections: [K, N, 3] points of K star-shaped sections of N points, all with one sense of rotation.
-    """
+    """The solid with flat ends through star-shaped sections [K, N, 3], all with one sense of rotation."""
     vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
     faces = _loft_faces(*sections.shape[:2])
     a, b, c = np.moveaxis((vertices - vertices.mean(0))[faces], 1, 0)
@@ -93,13 +85,8 @@ def _loft_faces(k: int, n: int) -> np.ndarray:
 
 
 def sweep(path: np.ndarray, section: np.ndarray, up: Point = (0, 0, 1)) -> Manifold:
-    """A section carried along a path: a curved rail, a bent tube, a slat.
-
-    Args:
-        path: [K, 3]; its bends must be wider than the section.
-        section: [N, 2] star-shaped polygon: first axis tangent x up, second along `up`.
-        up: direction the section's second axis follows; not parallel to the path.
-    """
+    """A star-shaped section [N, 2] carried along a path [K, 3]: its first axis is tangent x up, its second
+    along `up`, which is not parallel to the path; the path's bends must be wider than the section."""
     path = np.asarray(path, float)
     leaving = _unit(np.diff(path, axis=0))
     tangent = _unit(np.vstack([leaving[:1], leaving[:-1] + leaving[1:], leaving[-1:]]))
@@ -121,17 +108,15 @@ def bar(start: Point, end: Point, radius: float, end_radius: float | None = None
 
 def square_bar(start: Point, end: Point, width: float, end_width: float | None = None) -> Manifold:
     """A straight bar of square section with its sides along x and y, cut level at both ends."""
-    end_width = width if end_width is None else end_width
+    ends = (start, width), (end, width if end_width is None else end_width)
     square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
-    rings = [np.column_stack([w * square, np.zeros(4)]) + p for p, w in ((start, width), (end, end_width))]
-    return loft(np.array(rings))
+    return loft(np.array([np.column_stack([w * square, np.zeros(4)]) + p for p, w in ends]))
 
 
 def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold:
     """A straight board on edge from start to end, its height along z."""
-    half = np.array([thickness, height]) / 2
-    section = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
-    return sweep(np.array([start, end], float), section)
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    return sweep(np.array([start, end], float), square * (np.array([thickness, height]) / 2))
 
 
 def turned(start: Point, end: Point, profile: Profile) -> Manifold:
@@ -140,12 +125,9 @@ def turned(start: Point, end: Point, profile: Profile) -> Manifold:
 
 
 def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifold:
-    """A solid of revolution around z.
+    """A solid of revolution around z through a profile from bottom to top, radii > 0.
 
-    Args:
-        profile: (radius, height) from bottom to top, radii > 0; the axis closes it.
-        segments: sides of the circle.
-        stretch: let the polygon's area equal the circle's, so that few sides do not shrink it.
+    `stretch` lets the polygon's area equal the circle's, so that few sides do not shrink it.
     """
     turn = 2 * np.pi / segments
     ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
@@ -154,10 +136,7 @@ def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifol
 
 
 def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:
-    """An open shell of revolution around z: a lampshade, a bowl.
-
-    `profile` [N, 2] holds (radius, height) of its middle surface, radii > thickness / 2.
-    """
+    """An open shell of revolution around z through a profile [N, 2] of its middle, radii > thickness / 2."""
     profile = np.asarray(profile, float)
     tangent = _unit(np.gradient(profile, axis=0))
     normal = np.column_stack([tangent[:, 1], -tangent[:, 0]])
@@ -195,7 +174,7 @@ def arc(start: Point, end: Point, bulge: Point, count: int = 9) -> np.ndarray:
     return (1 - t) * start + t * end + 4 * t * (1 - t) * bulge
 
 
-def filleted(corners: Sequence[Point], radius: float, steps: int = 4) -> np.ndarray:
+def filleted(corners: Sequence[Point] | np.ndarray, radius: float, steps: int = 4) -> np.ndarray:
     """[K, 3] polyline through `corners` with its bends rounded by about `radius`."""
     points = np.asarray(corners, float)
     path = [points[0]]

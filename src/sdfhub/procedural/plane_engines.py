@@ -10,17 +10,15 @@ from sdfhub.procedural import plane_parts as pp
 def powerplant(plane) -> list[Manifold]:
     """The engines that the plane's kind has; its `engines` doubles their number where that can be."""
     kinds = {"airliner": _underwing_jets, "business jet": _rear_jets, "turboprop": _wing_propellers}
-    kinds |= {"single": _nose_propeller, "glider": lambda plane: [], "fighter": _afterburners}
-    return kinds[plane.kind](plane)
+    kinds |= {"single": _nose_propeller, "fighter": _afterburners}
+    return kinds[plane.kind](plane) if plane.kind in kinds else []
 
 
 def _underwing_jets(plane) -> list[Manifold]:
     """Nacelles on pylons ahead of and below the wing, one or two a side."""
-    made = []
-    shares = [(0.35 + plane.engine_shift, 1.0)]
-    if plane.engines == 2:
-        shares = [(0.32 + plane.engine_shift, 0.86), (0.6 + plane.engine_shift, 0.8)]
+    made, shares = [], [(0.35, 1.0)] if plane.engines == 1 else [(0.32, 0.86), (0.6, 0.8)]
     for share, scale in shares:
+        share += plane.engine_shift
         r = 0.037 * plane.engine_size * scale
         wing, edge = plane.wing_point(share), plane.leading_edge(share)
         centre = edge + [0, -2.0 * r, -1.35 * r - 0.006]

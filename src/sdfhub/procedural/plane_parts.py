@@ -13,31 +13,19 @@ from sdfhub.procedural import parts
 
 @dataclass(frozen=True)
 class Fuselage:
-    """A body along y whose section is a superellipse.
+    """A body along y whose section is a superellipse."""
 
-    Args:
-        radius: half the width of the cabin.
-        tall: height over width.
-        nose, tail: lengths over which the section grows and shrinks.
-        tip, end: section at the nose and at the tail, as shares of the cabin's.
-        bluntness: exponent of the nose; 0.5 is an ellipse, 0.9 nearly a cone.
-        boom: exponent of the tail; above 1 the body stays full for longer, below 1 it thins out early.
-        square: exponent of the section; 2 is an ellipse.
-        upsweep: rise of the tail's axis; at 1 the roof stays level.
-        droop: fall of the nose's axis, likewise.
-    """
-
-    radius: float
-    tall: float
-    nose: float
-    tail: float
-    tip: float
-    end: float
-    bluntness: float
-    boom: float
-    square: float
-    upsweep: float
-    droop: float
+    radius: float  # half the width of the cabin
+    tall: float  # height over width
+    nose: float  # length over which the section grows
+    tail: float  # length over which it shrinks
+    tip: float  # section at the nose as a share of the cabin's
+    end: float  # section at the tail, likewise
+    bluntness: float  # exponent of the nose; 0.5 is an ellipse, 0.9 nearly a cone
+    boom: float  # exponent of the tail; above 1 the body stays full for longer, below 1 it thins out early
+    square: float  # exponent of the section; 2 is an ellipse
+    upsweep: float = 0  # rise of the tail's axis; at 1 the roof stays level
+    droop: float = 0  # fall of the nose's axis, likewise
 
     def share(self, y: float) -> float:
         """The section at y as a share of the cabin's."""
@@ -102,21 +90,15 @@ class Station:
 
 
 def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Places [points] along a section of unit chord and thickness, and half its thickness [points] there.
-
-    Source: NACA report 460, thickness of the four-digit sections.
-    """
+    """Places along a section of unit chord and thickness, and half its thickness there (NACA report 460)."""
     x = (1 - np.cos(np.linspace(0, np.pi, points))) / 2
     powers = np.stack([np.sqrt(x), x, x**2, x**3, x**4])
     return x, 5 * np.array([0.2969, -0.126, -0.3516, 0.2843, -0.1036]) @ powers
 
 
 def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
-    """A wing, fin or tailplane through its stations, with a blunt trailing edge.
-
-    `ratio` is thickness over chord, `camber` that of the mean line in chords. `gauge` is the least thickness;
-    the trailing edge has 0.8 of it.
-    """
+    """A wing, fin or tailplane through its stations, with a blunt trailing edge of 0.8 `gauge`, the least
+    thickness. `ratio` is thickness over chord, `camber` that of the mean line in chords."""
     along, half = aerofoil()
     sections = []
     for s in stations:
@@ -131,14 +113,8 @@ def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber:
 
 
 def panel(root, direction, length: float, chords, sweep: float, ratio: float, gauge: float) -> Manifold:
-    """A tapered swept surface with a rounded tip, from a leading-edge point `root` along a direction.
-
-    Args:
-        direction: [2] unit vector in x, z; `length` is measured along it.
-        chords: at the root and at the tip.
-        sweep: of the leading edge, degrees.
-        ratio, gauge: as of `lifting_surface`.
-    """
+    """A tapered surface with a rounded tip, `length` long from a leading-edge point `root` along a direction
+    [2] in x, z; chords are at root and tip, `sweep` is of the leading edge in degrees."""
     roll = np.arctan2(direction[1], direction[0])
     back = np.tan(np.radians(sweep))
     stations = []
@@ -165,11 +141,8 @@ def jet(radius: float, length: float, centre) -> Manifold:
 
 
 def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
-    """A pointed spinner and twisted blades in the plane y = centre[1].
-
-    `radius` is that of the tips, `hub` that of the spinner's foot; blades are `gauge` thick, and the first
-    one stands at `turn` degrees.
-    """
+    """A pointed spinner with a foot of radius `hub`, and twisted blades, `gauge` thick, in the plane of its
+    centre; the first blade stands at `turn` degrees."""
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
     made = [body_of_revolution(parts.scaled(profile, hub, hub), centre, 14)]
     chord = max(0.22 * radius, 2.2 * gauge)
@@ -194,11 +167,8 @@ def wheel(radius: float, width: float, centre) -> Manifold:
 
 
 def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
-    """A bubble that rises from a line along y: a fighter's canopy, a light aircraft's cabin.
-
-    It stands on the height base(y) and is highest, and `half_width` wide to either side, at the share `peak`
-    of its length.
-    """
+    """A bubble on the height base(y): a fighter's canopy, a light aircraft's cabin. It is highest, and
+    `half_width` wide to either side, at the share `peak` of its length."""
     unit = superellipse(16, 2.4)
     sections = []
     for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 11))) / 2:

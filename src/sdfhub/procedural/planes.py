@@ -1,6 +1,6 @@
 """Aircraft: airliners, business jets, turboprops, light singles, gliders, fighters; one set of parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,15 +15,7 @@ class Proportions(NamedTuple):
     """What makes a kind of aircraft that kind; lengths in fuselage lengths, angles in degrees."""
 
     length: float  # metres
-    radius: float
-    tall: float
-    nose: float
-    tail: float
-    tip: float
-    end: float
-    bluntness: float
-    boom: float
-    square: float
+    body: pp.Fuselage
     span: float
     chord: float
     taper: float
@@ -36,32 +28,84 @@ class Proportions(NamedTuple):
 
 KINDS = {
     "airliner": Proportions(
-        38, 0.052, 1, 0.12, 0.38, 0.06, 0.16, 0.55, 1.15, 2, 0.96, 0.22, 0.26, 31, -0.13, 1.0, 0.06, 0.019
+        38,
+        pp.Fuselage(0.052, 1, 0.12, 0.38, 0.06, 0.16, 0.55, 1.15, 2),
+        0.96,
+        0.22,
+        0.26,
+        31,
+        -0.13,
+        1.0,
+        0.06,
+        0.019,
     ),
     "business jet": Proportions(
-        18, 0.06, 1, 0.2, 0.42, 0.07, 0.18, 0.62, 1.1, 2, 0.94, 0.2, 0.32, 28, -0.06, 1.0, 0.05, 0.018
+        18,
+        pp.Fuselage(0.06, 1, 0.2, 0.42, 0.07, 0.18, 0.62, 1.1, 2),
+        0.94,
+        0.2,
+        0.32,
+        28,
+        -0.06,
+        1.0,
+        0.05,
+        0.018,
     ),
     "turboprop": Proportions(
-        25, 0.056, 1.05, 0.14, 0.4, 0.1, 0.2, 0.55, 1.1, 2.2, 1.08, 0.13, 0.5, 4, -0.1, 1.05, 0.06, 0.021
+        25,
+        pp.Fuselage(0.056, 1.05, 0.14, 0.4, 0.1, 0.2, 0.55, 1.1, 2.2),
+        1.08,
+        0.13,
+        0.5,
+        4,
+        -0.1,
+        1.05,
+        0.06,
+        0.021,
     ),
     "single": Proportions(
-        8, 0.07, 1.12, 0.16, 0.62, 0.62, 0.2, 0.5, 0.9, 2.7, 1.3, 0.18, 0.72, 2, -0.2, 1.1, 0.085, 0.031
+        8,
+        pp.Fuselage(0.07, 1.12, 0.16, 0.62, 0.62, 0.2, 0.5, 0.9, 2.7),
+        1.3,
+        0.18,
+        0.72,
+        2,
+        -0.2,
+        1.1,
+        0.085,
+        0.031,
     ),
     "glider": Proportions(
-        7, 0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1, 1.75, 0.125, 0.42, 1.5, -0.16, 1.0, 0.014, 0.03
+        7,
+        pp.Fuselage(0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1),
+        1.75,
+        0.125,
+        0.42,
+        1.5,
+        -0.16,
+        1.0,
+        0.014,
+        0.03,
     ),
     "fighter": Proportions(
-        15, 0.054, 1.0, 0.36, 0.3, 0.05, 0.8, 0.75, 1.0, 2.4, 0.66, 0.4, 0.16, 46, -0.06, 1.05, 0.055, 0.022
+        15,
+        pp.Fuselage(0.054, 1.0, 0.36, 0.3, 0.05, 0.8, 0.75, 1.0, 2.4),
+        0.66,
+        0.4,
+        0.16,
+        46,
+        -0.06,
+        1.05,
+        0.055,
+        0.022,
     ),
 }
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One aircraft, its nose towards -y. The numbers scale or shift the proportions of its kind.
-
-    What a kind cannot have is read as its nearest: a jet with a tail wheel stands on a nose wheel.
-    """
+    """One aircraft, its nose towards -y. Numbers scale or shift the proportions of its kind; what a kind
+    cannot have is read as its nearest: a jet with a tail wheel stands on a nose wheel."""
 
     kind: str = choice(*KINDS)
     mount: str = choice("low", "low", "mid", "high", "high")
@@ -96,9 +140,8 @@ class Plane:
         if self.kind in ("airliner", "business jet", "turboprop"):
             body = self._windscreen(body)
         solids = [body, *self._wing(), *plane_tails.tail(self), *plane_engines.powerplant(self)]
-        return parts.union([*solids, *self._canopy(), *plane_gear.gear(self)]).scale(
-            (self.base.length * self.size,) * 3
-        )
+        whole = parts.union([*solids, *self._canopy(), *plane_gear.gear(self)])
+        return whole.scale((self.base.length * self.size,) * 3)
 
     @property
     def base(self) -> Proportions:
@@ -113,14 +156,11 @@ class Plane:
     @property
     def body(self) -> pp.Fuselage:
         """Its fuselage."""
-        b = self.base
+        b = self.base.body
         upsweep = 0.4 * self.upsweep if self.kind in ("fighter", "single") else self.upsweep
-        nose = b.nose * self.nose_length
-        radius = b.radius * self.girth
+        nose, radius = b.nose * self.nose_length, b.radius * self.girth
         end = max(b.end, 1.3 * self.gauge / radius)
-        return pp.Fuselage(
-            radius, b.tall, nose, b.tail, b.tip, end, b.bluntness, b.boom, b.square, upsweep, self.nose_droop
-        )
+        return replace(b, radius=radius, nose=nose, end=end, upsweep=upsweep, droop=self.nose_droop)
 
     @property
     def semi_span(self) -> float:

@@ -23,13 +23,9 @@ def _lean(sofa, z):
 
 
 def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Manifold:
-    """A leaning wall with rounded top and ends.
+    """A leaning wall with rounded top and ends, `top` [K] high at stations x [K] from left to right.
 
-    Args:
-        x: [K] increasing stations from the left end to the right.
-        top: [K] heights there.
-        push: how far the front swells towards -y: one number, [K] numbers, or a function of (x, heights).
-        rows: of facets on the front.
+    Its front of `rows` facets swells by `push` towards -y: a number, [K], or a function of (x, heights).
     """
     swelling = push if callable(push) else lambda s, z: np.interp(s, x, np.broadcast_to(push, x.shape))
     thick, low = sofa.back_thickness, sofa.leg_height

@@ -7,10 +7,7 @@ from sdfhub.procedural import parts
 
 
 def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps: int = 3) -> Manifold:
-    """A stuffed block of full extents `size` whose +z side swells, `crown` above its rim in the middle.
-
-    It is turned by `lean` degrees around x about its centre; radius and steps as in `rounded_box`.
-    """
+    """A rounded box whose +z side swells, `crown` above its rim in the middle, leant by degrees around x."""
     block = parts.rounded_box(size, (0, 0, 0), radius, steps)
     u, v = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-0.94, 0.94, 7)], indexing="ij"))
     inner = np.asarray(size) / 2 - [0.6 * radius, 0.6 * radius, 0]

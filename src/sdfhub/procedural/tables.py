@@ -8,8 +8,6 @@ from manifold3d import Manifold
 from sdfhub.procedural import parts
 from sdfhub.procedural.parameters import choice, continuous
 
-_FOUR_LEGS = ("square", "turned", "round", "hairpin")
-
 
 @dataclass(frozen=True)
 class Table:

@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ from tqdm import tqdm
 from sdfhub.checkpoint_file import LAST
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
-from sdfhub.reconstruction.reconstructor import Reconstructor
-from sdfhub.reconstruction.result import Limits
+from sdfhub.reconstruction.reconstructor import Limits, Reconstructor
 from sdfhub.scans.evidence import BOUNDS
 from sdfhub.scans.simulated import VIEWS, ScanKind
 from sdfhub.whole_file import file_sha256, write_whole
@@ -28,23 +26,17 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
-# what is judged: kept beside the settings, so that limits of another rule are not taken for these
+# what is judged: limits of another rule are not taken for these
 RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How limits are found.
+    """How limits are found."""
 
-    Args:
-        shapes: unseen shapes to fit, >= 3; 0 for no verdicts.
-        spread: standard deviations that a value's logarithm may lie above the mean of theirs.
-        reach: times the largest of theirs, however far theirs spread.
-    """
-
-    shapes: NonNegativeInt
-    spread: PositiveFloat
-    reach: PositiveFloat
+    shapes: NonNegativeInt  # unseen shapes to fit, >= 3; 0 for no verdicts
+    spread: PositiveFloat  # standard deviations that a value's logarithm may lie above the mean of theirs
+    reach: PositiveFloat  # times the largest of theirs, however far theirs spread
 
     def __post_init__(self):
         if 0 < self.shapes < 3:
@@ -64,17 +56,12 @@ class Calibration:
         reconstructor: Reconstructor,
         unseen_shapes: Callable[[int], list[StoredShape]],
     ) -> dict[ScanKind, Limits]:
-        """The limits of kinds of scans: the run's own, or measured now and kept.
+        """The limits of kinds of scans: the run's own, or measured now and kept in its folder.
 
         Args:
-            run: its folder.
-            settings: plain, all that fits depend on.
-            kinds: which are wanted.
-            reconstructor: fits scans.
+            run, settings: its folder; plain data of all that fits depend on.
+            kinds, reconstructor: which are wanted; fits scans.
             unseen_shapes: up to so many shapes of the run's data that it was not trained on.
-
-        Raises:
-            SdfhubError: the run's data cannot be had here, or it has too few unseen shapes.
         """
         key = digest(run, settings)
         known = _read(run / FILE).get(key, {})
@@ -103,9 +90,9 @@ class Calibration:
             fitted = reconstructor.fitted([scan])
             residuals.append(float(fitted.residuals))
             doubts.append(float(reconstructor.doubts(fitted)))
-        limits = Limits(self.limit(np.array(residuals)), self.limit(np.array(doubts)))
+        limits = {"residual": self.limit(np.array(residuals)), "doubt": self.limit(np.array(doubts))}
         ids = [shape.id for shape in shapes]
-        return {"limits": asdict(limits), "residuals": residuals, "doubts": doubts, "shapes": ids}
+        return {"limits": limits, "residuals": residuals, "doubts": doubts, "shapes": ids}
 
 
 def digest(run: Path, settings: dict[str, Any]) -> str:

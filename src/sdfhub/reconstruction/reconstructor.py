@@ -1,55 +1,89 @@
-"""Scans through a trained space: observed, fitted, meshed in their own frames, judged, written one by one."""
+"""Scans through a trained space: observed, fitted, meshed in their own frames, judged, written one by one.
 
+A result is NAME.ply, NAME.json and a line of a table.
+"""
+
+import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from tabulate import tabulate
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.mesher import Mesh
 from sdfhub.latent.fitting import Fit, Fitted
 from sdfhub.latent.similarity import PoseRange
-from sdfhub.reconstruction.result import Limits, Result
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, ScanFrame, observe
 from sdfhub.scans.scan import read_scan
 from sdfhub.scans.simulated import ScanKind
+from sdfhub.shapes import Mesh
 from sdfhub.space import Space
+from sdfhub.whole_file import write_whole
+
+Verdict = Literal["fitted", "doubtful", "unjudged", "failed"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What residual and doubt of a fit may be at most, for it not to be doubtful."""
+
+    residual: float
+    doubt: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """The reconstruction of one scan."""
+
+    name: str  # of its files
+    kind: str = ""  # what it was judged as; empty where it failed
+    residual: float | None = None  # mean violation of the scan's bounds, normalised units
+    doubt: float | None = None  # the same times the fourth power of one plus how unusual its code is
+    limits: Limits | None = None  # what these two may be at most; None where nothing was calibrated
+    verdict: Verdict = "failed"
+    reason: str = ""  # of a verdict other than fitted
+    code: tuple[float, ...] = ()  # [L]
+    frame: tuple[tuple[float, ...], ...] = ()  # matrix [4][4] from the normalised frame to the scan's
+    mesh: str | None = None  # file name; None without a surface
+
+    def judged(self, limits: Limits | None, is_near: bool) -> "Result":
+        """The same with a verdict; `is_near` tells whether its pose lies within the range of poses."""
+        verdict: Verdict = "doubtful"
+        if self.mesh is None:
+            reason = "the field has no surface"
+        elif not is_near:
+            reason = "no pose within poses.scale, poses.tilt and poses.shift was found"
+        elif limits is None or self.residual is None or self.doubt is None:
+            verdict, reason = "unjudged", "nothing was calibrated"
+        else:
+            shares = {"residual": self.residual / limits.residual, "doubt": self.doubt / limits.doubt}
+            reason = ", ".join(f"{name} {x:.2f} x its limit" for name, x in shares.items() if not x <= 1)
+            verdict = "doubtful" if reason else "fitted"
+        return replace(self, limits=limits, verdict=verdict, reason=reason)
+
+    def write(self, out: Path) -> None:
+        """Writes NAME.json into a folder."""
+        write_whole(out / f"{self.name}.json", json.dumps(asdict(self), indent=1))
 
 
 @dataclass(frozen=True)
 class Reconstructor:
-    """A trained space and how scans are fitted in it.
-
-    Args:
-        space: where codes are looked for.
-        fit: finds codes and poses.
-        evidence: makes observations of scans.
-        frame: of the scans.
-        poses: how far the scans' frames may be off; None where they are known.
-        resolution: points along an axis of the marching-cubes grid, >= 2.
-    """
+    """A trained space and how scans are fitted in it."""
 
     space: Space
     fit: Fit
     evidence: Evidence
     frame: ScanFrame
-    poses: PoseRange | None
-    resolution: int
+    poses: PoseRange | None  # how far the scans' frames may be off; None where they are known
+    resolution: int  # points along an axis of the marching-cubes grid, >= 2
 
     def read(self, path: Path, sensor: Sequence[float] | None) -> ObservedScan:
-        """The scan in a file, observed; the same file gives the same observation.
-
-        Args:
-            path: of a scan.
-            sensor: [3] from where a cloud was seen that does not say so itself, in its frame, or None.
-
-        Raises:
-            SdfhubError: names the file.
-        """
+        """The scan in a file, observed; `sensor` [3] is where a cloud was seen from that does not say so."""
         scan = read_scan(path)
         if sensor is not None and scan.kind in ("bare", "oriented"):
             scan = replace(scan, sensor=np.array(sensor, dtype=np.float64))
@@ -79,15 +113,9 @@ class Reconstructor:
     def reconstruct(
         self, scans: Mapping[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path, together: int
     ) -> Iterator[Result]:
-        """Fits and meshes scans by name and writes NAME.ply and NAME.json of each, as they are found.
+        """Fits and meshes scans by name, `together` side by side, and writes NAME.ply and NAME.json of each.
 
         One that fails does not stop the others.
-
-        Args:
-            scans: by the names of their files.
-            limits: by kind of scan.
-            out: folder.
-            together: scans fitted side by side.
         """
         names = list(scans)
         for first in range(0, len(names), together):
@@ -105,22 +133,20 @@ class Reconstructor:
     ) -> list[Result]:
         scans, results = list(group.values()), []
         fitted = self.fitted(scans)
-        doubts = self.doubts(fitted).tolist()
-        near = [True] * len(group)
-        if self.poses and fitted.poses:
-            near = self.poses.holds(fitted.poses).tolist()
+        doubts = self.doubts(fitted)
+        near = self.poses.holds(fitted.poses) if self.poses and fitted.poses else [True] * len(group)
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
             result = Result(
                 name,
                 kind=str(kind),
                 residual=float(fitted.residuals[row]),
-                doubt=doubts[row],
+                doubt=float(doubts[row]),
                 code=tuple(fitted.codes[row].tolist()),
                 frame=tuple(map(tuple, matrix.tolist())),
-                mesh=f"{name}.ply" if len(mesh[1]) else None,
+                mesh=f"{name}.ply" if len(mesh.faces) else None,
             )
-            results.append(result.judged(limits.get(kind), near[row]))
+            results.append(result.judged(limits.get(kind), bool(near[row])))
             write_mesh(*mesh, out / f"{name}.ply")
             results[-1].write(out)  # last: a result is whole when it is described
         return results
@@ -134,3 +160,24 @@ def to_scan(scan: ObservedScan, fitted: Fitted, row: int) -> np.ndarray:
         scale, rotation, shift = (part[row].double().cpu().numpy() for part in fitted.poses)
         pose[:3] = np.column_stack([scale * rotation, shift])
     return observed_to_scan @ np.linalg.inv(pose)
+
+
+def is_result(path: Path) -> bool:
+    """Whether a mesh is the result of an earlier command: the JSON beside it says so."""
+    try:
+        content = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and "verdict" in content and content.get("mesh") == path.name
+
+
+def table(results: Sequence[Result]) -> str:
+    """A line a scan: verdict, residual and doubt beside their limits, times 10^3, what it was judged as."""
+    lines = [["scan", "verdict", "residual x10^3", "limit", "doubt x10^3", "limit", "judged as"]]
+    for result in results:
+        limits = asdict(result.limits) if result.limits else {}
+        numbers = result.residual, limits.get("residual"), result.doubt, limits.get("doubt")
+        cells = [f"{1e3 * value:.3f}" if value is not None else "" for value in numbers]
+        reason = f"; {result.reason}" if result.reason and result.verdict != "failed" else ""
+        lines.append([result.name, result.verdict, *cells, result.kind + reason])
+    return tabulate(lines, headers="firstrow", disable_numparse=True)

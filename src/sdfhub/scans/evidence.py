@@ -3,18 +3,24 @@
 from dataclasses import replace
 from typing import Annotated
 
+import igl
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from pydantic.dataclasses import dataclass
+from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
-from sdfhub.scans import cloud
 from sdfhub.shapes import Observation
 
 GAPS = 3  # median distances between neighbours that a random cloud may leave bare around a point
 PLANES = 8  # nearest points whose tangent planes a place is at least from: at an edge, those of both sides
 BOUNDS = 2  # raised when the same scan gives other bounds: what was measured with the old ones counts no more
 SEALED = 5  # median distances between neighbours that no gap of a random cloud reaches across
+NEIGHBOURS = 10  # points that a tangent plane is fitted to
+ENOUGH = 8192  # points that noise is measured on: of more, neighbours lie within the noise of each other
+QUIETEST, SHARE = 0.3, 0.817  # flattest places, and what they show of the noise (chi of 7 degrees of freedom)
+EDGE = 1.2  # half the edge of the cube in which the outside is flooded, normalised frame
+RAYS = 4  # rays nearest to a place that must all have passed it
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -24,28 +30,18 @@ class Evidence:
     """How an observation is made of a scan.
 
     Source: the jitter of points near the surface is DeepSDF's (its published code).
-
-    Args:
-        rows: N, bounded points of an observation.
-        samples: the same of signed samples: as many as `evaluate` fits.
-        surface: share of them on the surface.
-        uniform: share of them anywhere in the cube, or in the space a sensor saw to be empty.
-        variances: squared standard deviations of the jitter of the others, normalised units squared.
-        cells: along an axis of the grid of empty space.
-        certain: a sign counts where the winding number is this far from 1/2.
-        background: whether a sensor's rays beside those that met something crossed empty space.
-        quiet: noise below this is none, normalised frame: a smooth surface's curvature looks like it.
     """
 
-    rows: Annotated[int, Field(ge=4)] = 8192
-    samples: Annotated[int, Field(ge=4)] = 16384
-    surface: Share = 0.25
-    uniform: Share = 0.15
+    rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
+    samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
+    surface: Share = 0.25  # of them on the surface
+    uniform: Share = 0.15  # of them anywhere in the cube, or in the space a sensor saw to be empty
+    # squared standard deviations of the jitter of the others, normalised units squared
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
-    cells: Annotated[int, Field(ge=8)] = 64
-    certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2
-    background: bool = False
-    quiet: NonNegativeFloat = 0.003
+    cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
+    certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
+    background: bool = False  # whether a sensor's rays beside those that met something crossed empty space
+    quiet: NonNegativeFloat = 0.003  # noise below this is none: a smooth surface's curvature looks like it
 
     def __post_init__(self):
         if self.surface + self.uniform > 1:
@@ -64,11 +60,11 @@ class Evidence:
     ) -> Observation:
         """From points [M, 3] all over a closed surface, normalised frame, with normals [M, 3] or without.
 
-        The distance of a place is at most that to the nearest point, and at least that to tangent planes
-        there or what the gaps between points leave. With normals the winding number tells its sign; without
-        them it is known only where one comes from outside without meeting the cloud.
+        A place is at most as far as the nearest point, and at least as far as tangent planes there or what
+        the gaps between points leave. With normals the winding number tells its side; without them it is
+        known only where one comes from outside without meeting the
         """
-        noise, spacing = self._noise_in(points), cloud.spacing_of(points)
+        noise, spacing = self._noise_and_spacing(points)
         _, uniform, near = self._counts()
         deviation = np.sqrt(self.variances)[np.arange(near) % len(self.variances), None]
         at = points[rng.integers(len(points), size=near)] + deviation * rng.standard_normal((near, 3))
@@ -78,14 +74,12 @@ class Evidence:
         # the nearest of many scattered points lies nearer than the surface
         least = np.sqrt(np.maximum(np.maximum(distance - noise, 0) ** 2 - (GAPS * spacing) ** 2, 0))
         if normals is None:
-            # a wall thinner than the flood's own cells would let it through
-            reach = max(SEALED * spacing, 3 * noise, cloud.cell_radius(self.cells))
-            outside = cloud.is_outside(points, at, reach, self.cells)
+            outside = is_outside(points, at, max(SEALED * spacing, 3 * noise), self.cells)
             inside = np.zeros_like(outside)
         else:
             apart = np.einsum("ijk,ijk->ij", at[:, None] - points[nearest], normals[nearest])
             least = np.maximum(least, np.abs(apart).min(axis=1) - 2 * noise)
-            turns = cloud.winding(points, normals, cloud.areas_of(points), at)
+            turns = winding(points, normals, at)
             outside, inside = turns < 0.5 - self.certain, turns > 0.5 + self.certain
         most, unsigned = distance + 3 * noise, ~outside & ~inside
         low = np.where(outside | unsigned, least, -most)
@@ -96,14 +90,13 @@ class Evidence:
     ) -> Observation:
         """From points [M, 3] that one sensor at `sensor` [3] saw, with normals [M, 3] or without.
 
-        Free space is at least as far from any surface as from space not known to be free, and nothing is
-        further from the surface than from the nearest seen point. Beside the seen points, the side of the
-        sensor is outside.
+        Free space is at least as far from any surface as from space not known to be free, and at most as far
+        as from the nearest seen point. Beside the seen points, the side of the sensor is outside.
         """
-        noise, spacing, tree = self._noise_in(points), cloud.spacing_of(points), cKDTree(points)
+        (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
         beside, steps = self._beside(points, normals, sensor, max(2 * spacing, 3 * noise), tree, rng)
         slack = np.where(steps > 0, noise, np.abs(steps))  # the part may be thin behind its face
-        empty, clear = cloud.free_space(points, sensor, self.cells, self.background)
+        empty, clear = free_space(points, sensor, self.cells, self.background)
         _, uniform, _ = self._counts()
         rows = rng.integers(len(empty), size=uniform) if len(empty) else np.zeros(0, np.int64)
         at = np.concatenate([beside, empty[rows]])
@@ -115,11 +108,11 @@ class Evidence:
     def _beside(self, points, normals, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
         """Places [Q, 3] a step before and behind seen points, and the signed steps [Q].
 
-        Where normals are not given, only the flatter half of the surface has such that can be trusted.
+        Without given normals, only the flatter half of the surface has such that can be trusted.
         """
         flat = np.arange(len(points))
         if normals is None:
-            normals, scatter = cloud.tangent_planes(points)
+            normals, scatter = tangent_planes(points)
             flat = np.flatnonzero(scatter <= np.median(scatter))
         away = np.einsum("ij,ij->i", normals, points - sensor) > 0
         normals = np.where(away[:, None], -normals, normals)
@@ -129,10 +122,10 @@ class Evidence:
         own = rng.choice(own, self._counts()[2]) if len(own) else own
         return beside[own], steps[own]
 
-    def _noise_in(self, points: np.ndarray) -> float:
-        """The noise of points [M, 3], normalised frame, or 0 where there is hardly any."""
-        noise = cloud.noise_of(points)
-        return noise if noise > self.quiet else 0.0
+    def _noise_and_spacing(self, points: np.ndarray) -> tuple[float, float]:
+        """Of points [M, 3], normalised frame; no noise where there is hardly any."""
+        noise = noise_of(points)
+        return (noise if noise > self.quiet else 0.0), spacing_of(points)
 
     def _counts(self) -> tuple[int, int, int]:
         """How many rows lie on the surface, anywhere, and near the surface."""
@@ -150,3 +143,87 @@ class Evidence:
         at, low, high, unsigned = (np.concatenate(pair)[order] for pair in pairs)
         points, low, high = (part.astype(np.float32) for part in (at, low, high))
         return Observation(points, low, high, unsigned, float(noise))
+
+
+def spacing_of(points: np.ndarray) -> float:
+    """Median distance from a point of [N, 3] to its nearest neighbour, in its units."""
+    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+
+
+def noise_of(points: np.ndarray) -> float:
+    """Standard deviation of points [N, 3] across their surface, in their units.
+
+    How far neighbours scatter about their plane, at the flattest places. Curves look a little noisy.
+    """
+    _, scatter = tangent_planes(points[:: max(1, -(-len(points) // ENOUGH))])
+    unbiased = np.sqrt(NEIGHBOURS / (NEIGHBOURS - 3))  # a plane takes three numbers
+    return float(np.quantile(scatter, QUIETEST) * unbiased / SHARE)
+
+
+def tangent_planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [N, 3], of either sign, and the neighbours' root mean square distance to the plane [N]."""
+    _, near = cKDTree(points).query(points, min(NEIGHBOURS, len(points)))
+    apart = points[near] - points[near].mean(axis=1, keepdims=True)
+    values, axes = np.linalg.eigh(apart.transpose(0, 2, 1) @ apart / near.shape[1])
+    return axes[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0))
+
+
+def grid_of(axis: np.ndarray) -> np.ndarray:
+    """[n^3, 3] the nodes of a cubic grid with these coordinates [n] along each axis."""
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+
+def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> np.ndarray:
+    """[Q] whether places `at` [Q, 3] can be reached from afar without coming near a cloud [N, 3].
+
+    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`, or than half a cell's
+    diagonal, as thinner walls would let it through.
+    """
+    reach = max(reach, 3**0.5 * EDGE / (cells - 1))
+    nodes = grid_of(np.linspace(-EDGE, EDGE, cells))
+    near = np.isfinite(cKDTree(points).query(nodes, distance_upper_bound=reach)[0]).reshape((cells,) * 3)
+    pieces, _ = label(np.pad(~near, 1, constant_values=True))  # afar is free, though the corners may be near
+    cell = np.rint((at + EDGE) / (2 * EDGE) * (cells - 1)).astype(np.int64).clip(0, cells - 1) + 1
+    return pieces[tuple(cell.T)] == pieces[0, 0, 0]
+
+
+def winding(points: np.ndarray, normals: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """[Q] winding numbers of an oriented cloud [N, 3] about the points `at` [Q, 3]: near 1 inside, 0 outside.
+
+    Source: Barill et al. 2018; a point stands for a disc up to its neighbours, shared with them.
+    """
+    distance = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[0]
+    areas = np.pi * distance[:, -1] ** 2 / (distance.shape[1] - 1)
+    return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
+
+
+def free_space(
+    points: np.ndarray, sensor: np.ndarray, cells: int, background: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of [-1, 1]^3 that a sensor [3] whose rays ended at points [N, 3] saw to be empty.
+
+    A cell is free if the rays nearest to it, no further apart than rays are from each other, ended a cell
+    behind it; with `background` also where no ray ended near. Its distance to the nearest cell that is not
+    free bounds that to any surface, seen or unseen: centres [K, 3], and lower bounds [K] >= 0 there.
+    """
+    size = 2 / cells
+    centres = grid_of(-1 + size * (np.arange(cells) + 0.5))
+    rays, reached = _directions(points - sensor)
+    towards, depth = _directions(centres - sensor)
+    tree = cKDTree(rays)
+    wide = 2 * np.median(tree.query(rays, 2)[0][:, 1])
+    # a cell is as wide as its own rays: no other may end in it
+    apart, near = tree.query(towards, RAYS, distance_upper_bound=float(max(wide, 0.02)))
+    is_free = np.zeros(len(centres), bool)
+    rows = np.flatnonzero(np.isfinite(apart).all(axis=1))
+    is_free[rows] = depth[rows] < reached[near[rows]].min(axis=1) - size
+    if background:
+        is_free |= np.isinf(apart).all(axis=1)
+    padded = np.pad(is_free.reshape((cells,) * 3), 1)  # nothing is known beyond the cube
+    clear = distance_transform_edt(padded)[1:-1, 1:-1, 1:-1].ravel()[is_free]
+    return centres[is_free], np.maximum(clear - np.sqrt(3), 0) * size
+
+
+def _directions(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    length = np.linalg.norm(vectors, axis=1)
+    return vectors / np.maximum(length, 1e-12)[:, None], length

@@ -19,26 +19,18 @@ ScanFrame = Frame | Literal["shape", "unknown"]
 """How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
 
 MOST = 2**16  # points of a cloud that are used: a random draw of more
-# distance of the farthest point from the origin that a scan in the normalised frame may have
-LARGEST, SMALLEST = 1.2, 0.2
+LARGEST, SMALLEST = 1.2, 0.2  # distance of the farthest point from the origin, normalised frame
 FAR = 2.5  # the same of signed samples, which are also drawn around the shape
 
 
 @dataclass(frozen=True)
 class ObservedScan:
-    """What a scan says of the shape behind it.
+    """What a scan says of the shape behind it."""
 
-    Args:
-        kind: samples, oriented, bare or view.
-        count: points of the scan.
-        observation: in the normalised frame, or near it where that is unknown.
-        frame: where the observation's frame lies in the scan's.
-    """
-
-    kind: str
-    count: int
-    observation: Observation
-    frame: Frame
+    kind: str  # samples, oriented, bare or view
+    count: int  # points of the scan
+    observation: Observation  # in the normalised frame, or near it where that is unknown
+    frame: Frame  # where the observation's frame lies in the scan's
 
 
 def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
@@ -46,12 +38,9 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
 
     A mesh becomes signed samples. Signed samples lie in the normalised frame as they are, unless another
     known frame is given. A view shows no whole bounding box, so that its frame must be known or unknown.
-
-    Raises:
-        SdfhubError: the scan does not fit the frame; RejectedMesh where its mesh cannot be trusted.
     """
     if scan.faces is not None:
-        return _observe_mesh(scan.points, scan.faces, evidence, frame, rng)
+        return _observe_mesh(scan, scan.faces, evidence, frame, rng)
     if scan.kind == "view" and frame == "shape":
         raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
     if isinstance(frame, Frame):
@@ -66,8 +55,7 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
         observation = evidence.of_samples(points, scan.sdf * lies.scale, rng)
         lies = scan.frame if scan.frame is not None and lies is NORMALIZED else lies
         return ObservedScan("samples", len(points), observation, lies)
-    # repeated points would look infinitely dense
-    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    rows = np.sort(np.unique(points, axis=0, return_index=True)[1])  # repeated ones look infinitely dense
     if len(rows) < LEAST:
         raise SdfhubError(f"holds {len(rows)} different points; at least {LEAST} are needed to know a shape")
     rows = rows[rng.permutation(len(rows))[:MOST]] if len(rows) > MOST else rows
@@ -80,29 +68,26 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
 
 
 def _observe_mesh(
-    vertices: np.ndarray, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
+    scan: Scan, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
 ) -> ObservedScan:
     if isinstance(frame, Frame):
-        _refuse_misplaced(frame.to_normalized(vertices), LARGEST)
+        _refuse_misplaced(frame.to_normalized(scan.points), LARGEST)
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
-    prepared = prepare_mesh((vertices, faces), preparation)
+    prepared = prepare_mesh((scan.points, faces), preparation)
     points, sdf, own = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64), prepared.frame
     if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
-        observed = observe(Scan(own.to_source(points), sdf=sdf / own.scale), evidence, frame, rng)
+        samples = Scan(own.to_source(points), sdf=sdf / own.scale)
     else:
-        observed = observe(Scan(points, sdf=sdf, frame=own), evidence, NORMALIZED, rng)
-    return replace(observed, count=len(vertices))
+        samples, frame = Scan(points, sdf=sdf, frame=own), NORMALIZED
+    return replace(observe(samples, evidence, frame, rng), count=len(scan.points))
 
 
 def observations_of(
     shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]
 ) -> list[Observation]:
-    """Signed samples of prepared shapes as observations.
+    """Signed samples of prepared shapes as observations: so many of each, half of them inside; None for all.
 
-    Args:
-        shapes: normalised frame.
-        samples: of each, half of them inside; None for all.
-        seeds: one a shape, so that its samples do not depend on its neighbours.
+    A shape has a seed of its own, so that its samples do not depend on its neighbours.
     """
     observations = []
     for shape, seed in zip(shapes, seeds, strict=True):
@@ -115,7 +100,6 @@ def observations_of(
 
 
 def _refuse_misplaced(points: np.ndarray, largest: float) -> None:
-    """Refuses points [N, 3] of another frame than the normalised one."""
     reach = float(np.linalg.norm(points, axis=1).max())
     if not SMALLEST <= reach <= largest:
         advice = "; give frame=shape if it is whole" if largest == LARGEST else ""

@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
+from sdfhub.geometry.render import seen_from
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.scans.evidence import Evidence
@@ -17,10 +17,10 @@ from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, NormalizedMesh
 
-# levels of noise that are told apart, normalised frame
-NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)
-# half the width of a sensor's picture at distance 1: wide enough for the unit ball from 2.5 away
-HALF_VIEW = np.tan(np.radians(24))
+NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)  # told apart, normalised frame
+HALF_VIEW = np.tan(
+    np.radians(24)
+)  # half a picture's width at distance 1: it holds the unit ball from 2.5 away
 DISTANCE, HEIGHT = 2.5, 0.5  # of sensors from the origin, and how far up they may stand, as a sine
 PIXELS = 100
 LOOKS = 20  # places tried for a sensor, until it sees enough points to know a shape
@@ -29,21 +29,14 @@ VIEWS = 2  # simulated of each shape: a view depends on where the sensor stood
 
 @dataclass(frozen=True)
 class ScanKind:
-    """What scans have in common that are judged by the same limits: what can be simulated.
+    """What scans have in common that are judged by the same limits: what can be simulated."""
 
-    Args:
-        kind: samples, oriented, bare or view.
-        count: points, a power of two; 0 where their number does not matter.
-        noise: one of NOISES.
-    """
-
-    kind: str
-    count: int = 0
-    noise: float = 0.0
+    kind: str  # samples, oriented, bare or view
+    count: int = 0  # points, a power of two; 0 where their number does not matter
+    noise: float = 0.0  # one of NOISES
 
     @classmethod
     def of(cls, scan: ObservedScan) -> "ScanKind":
-        """The kind of an observed scan."""
         if scan.kind == "samples":
             return cls("samples")
         least = 0.95 * scan.observation.noise  # noisier scans leave larger residuals
@@ -57,17 +50,14 @@ class ScanKind:
 
     def observations(self, shapes: Sequence[StoredShape], evidence: Evidence) -> list[ObservedScan]:
         """Simulated scans of shapes, observed in the normalised frame: one of each shape, several views."""
-        pairs = [(shape, number) for shape in shapes for number in range(VIEWS if self.kind == "view" else 1)]
-        rngs = [np.random.default_rng([shape_seed(shape), number]) for shape, number in pairs]
-        scans = [self.scan(*pair) for pair in pairs]
-        return [observe(scan, evidence, NORMALIZED, rng) for scan, rng in zip(scans, rngs, strict=True)]
+        observed = []
+        for shape, number in product(shapes, range(VIEWS if self.kind == "view" else 1)):
+            rng = np.random.default_rng([shape_seed(shape), number])
+            observed.append(observe(self.scan(shape, number), evidence, NORMALIZED, rng))
+        return observed
 
     def scan(self, shape: StoredShape, number: int = 0) -> Scan:
-        """A simulated scan of a shape, in the normalised frame; another number gives another one.
-
-        Raises:
-            SdfhubError: the shape has no mesh to be scanned.
-        """
+        """A simulated scan of a shape, in the normalised frame; another number gives another one."""
         rng = np.random.default_rng([shape_seed(shape), number])
         if self.kind == "samples":
             rows = np.concatenate([shape.read("outside"), shape.read("inside")]).astype(np.float64)
@@ -89,8 +79,8 @@ def random_sensor(rng: np.random.Generator, up: UpAxis) -> np.ndarray:
     """[3] a place around the unit ball, not far above or below its middle."""
     height, turn = rng.uniform(-HEIGHT, HEIGHT), rng.uniform(0, 2 * np.pi)
     flat = np.sqrt(1 - height**2)
-    x, y, z = flat * np.cos(turn), flat * np.sin(turn), height
-    return DISTANCE * np.array([x, y, z] if up == "z" else [x, z, y])
+    x, y = flat * np.cos(turn), flat * np.sin(turn)
+    return DISTANCE * np.array([x, y, height] if up == "z" else [x, height, y])
 
 
 def surface_scan(
@@ -108,17 +98,9 @@ def view_scan(
 
     At most one of each of the picture's pixels * pixels; noise is the standard deviation along the rays.
     """
-    scene = EmbreeScene()
-    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-    forward = -sensor / np.linalg.norm(sensor)
-    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right = np.cross(-sensor, np.eye(3)[np.abs(sensor).argmin()])
     right /= np.linalg.norm(right)
-    steps = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * HALF_VIEW
-    x, y = np.meshgrid(steps, steps)
-    rays = forward + x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(right, forward)
-    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    origins = np.broadcast_to(sensor.astype(np.float32), rays.shape).copy()
-    hits = scene.run(origins, rays, query="INTERSECT", output=1)
+    _, rays, hits = seen_from(sensor, right, HALF_VIEW, pixels, mesh.vertices, mesh.faces)
     seen = hits["primID"] >= 0
     depth = hits["tfar"][seen] + noise * rng.standard_normal(seen.sum())
     return sensor + depth[:, None] * rays[seen].astype(np.float64)

@@ -8,9 +8,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.animation import animation
-from sdfhub.geometry.contact_sheet import contact_sheet
 from sdfhub.geometry.mesh_file import write_mesh, write_row
+from sdfhub.geometry.picture_file import animation, contact_sheet
 from sdfhub.geometry.render import render
 from sdfhub.opening import beside, load
 from sdfhub.scans.scan import read_scan

@@ -19,8 +19,7 @@ from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.opening import beside, load
 from sdfhub.reconstruction.calibration import Calibration
-from sdfhub.reconstruction.reconstructor import Reconstructor
-from sdfhub.reconstruction.result import Limits, Result, is_result, table
+from sdfhub.reconstruction.reconstructor import Limits, Reconstructor, Result, is_result, table
 from sdfhub.scans.observed_scan import ObservedScan, ScanFrame
 from sdfhub.scans.scan import FORMATS
 from sdfhub.scans.simulated import ScanKind

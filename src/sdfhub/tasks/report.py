@@ -16,7 +16,7 @@ from sdfhub.data.store.store import Store, preparation_hash
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.contact_sheet import contact_sheet
+from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.opening import data_of
 from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, loss_chart, picture_uri
 from sdfhub.report.results import Cell, read_plan, read_sweep

@@ -14,8 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.errors import RejectedMesh
-from sdfhub.geometry.sphere import sphere_directions
-from sdfhub.geometry.surface_sampling import points_on_faces
+from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
 from sdfhub.shapes import NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 

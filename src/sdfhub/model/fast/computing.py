@@ -19,34 +19,26 @@ from sdfhub.model.encodings import Encoding
 from sdfhub.model.fast.fused_hash import can_fuse, fused
 from sdfhub.model.fast.side_by_side import side_by_side
 
+# samples worked on together: what stays in a core's caches; what fills a GPU and not its memory
 TOGETHER = {"cpu": 2**13, "cuda": 2**18}
-"""Samples worked on together: what stays in a core's caches; what fills a GPU and not its memory."""
-
-LEAST = 2**10
-"""Samples that are worth a thread of their own."""
-
+LEAST = 2**10  # samples that are worth a thread of their own
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # names of options in glibc's malloc.h
 
 
 @dataclass(frozen=True)
 class Computing:
-    """Settings that suit a device; None takes what does.
-
-    Args:
-        points_at_once: samples that go through the decoder together, on a CPU in each thread, >= 1; bounds
-            memory.
-        compile: whether `torch.compile` fuses the decoder's passes, which needs a C compiler at run time.
-            None: on a GPU, where that and Triton are there; what then does not compile runs as it is.
-        tinycudann: whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order.
-            None: on a GPU, where it is installed and agrees, unless deterministic algorithms are asked for.
-        matmul: precision of float32 products, as in `torch.set_float32_matmul_precision`. None: `high`
-            (TF32) on a GPU, else `highest`.
-    """
+    """Settings that suit a device; None takes what does."""
 
     points_at_once: PositiveInt | None = None
+    """Samples that go through the decoder together, on a CPU in each thread; bounds memory."""
     compile: bool | None = None
+    """Whether `torch.compile` fuses the decoder's passes, which needs a C compiler. None: on a GPU, where
+    that and Triton are there; what then does not compile runs as it is."""
     tinycudann: bool | None = None
+    """Whether tiny-cuda-nn computes a hash encoding; it adds up a table's gradient in any order. None: on a
+    GPU, where it is installed and agrees, unless deterministic algorithms are asked for."""
     matmul: Literal["highest", "high", "medium"] | None = None
+    """Precision of float32 products. None: `high` (TF32) on a GPU, else `highest`."""
 
     def threads(self, device: torch.device) -> int:
         """Threads that work on samples of their own: on a CPU all, but what is compiled has one caller."""
@@ -63,14 +55,9 @@ class Computing:
         keep_freed_memory()
 
     def quickest(self, encoding: Encoding, device: torch.device) -> Encoding:
-        """The encoding, or its twin by tiny-cuda-nn.
-
-        Raises:
-            SdfhubError: the twin was asked for, and there is none here that agrees.
-        """
-        wanted = self.tinycudann or (
-            self.tinycudann is None and not torch.are_deterministic_algorithms_enabled()
-        )
+        """The encoding, or its twin by tiny-cuda-nn, refused where it was asked for and none here agrees."""
+        is_default, must_repeat = self.tinycudann is None, torch.are_deterministic_algorithms_enabled()
+        wanted = not must_repeat if is_default else self.tinycudann
         twin = fused(encoding) if wanted and can_fuse(encoding, device) else encoding
         if self.tinycudann and twin is encoding:
             raise SdfhubError(
@@ -84,29 +71,19 @@ class Computing:
 
         What an earlier training of this process compiled is forgotten: there is room for few versions.
         """
-        if not (can_compile(device) if self.compile is None else self.compile):
+        has_compilers = bool(shutil.which(os.environ.get("CC", "cc")) and find_spec("triton"))
+        if not (device.type == "cuda" and has_compilers if self.compile is None else self.compile):
             return functions
         import torch._dynamo.config as dynamo  # here: it imports the compiler
 
         torch.compiler.reset()
-        # unless it was asked for, what does not compile runs as it is; the backward pass has to be compiled
-        # with the forward one for that
+        # unless asked for, what does not compile runs as it is; backward is compiled with forward for that
         dynamo.suppress_errors = aot.force_non_lazy_backward_lowering = self.compile is None
         return tuple(torch.compile(function) for function in functions)
 
 
-def can_compile(device: torch.device) -> bool:
-    """Whether it is a GPU, and what `torch.compile` needs for it beside PyTorch is there."""
-    return device.type == "cuda" and bool(shutil.which(os.environ.get("CC", "cc")) and find_spec("triton"))
-
-
 def distances(decoder: Decoder, points: Tensor, codes: Tensor) -> Tensor:
-    """`decoder(points, codes)` [B, N], in parts: on a CPU side by side, else one after the other.
-
-    Args:
-        points: [B, N, 3], normalised frame.
-        codes: [B, L].
-    """
+    """`decoder(points, codes)` [B, N], in parts: on a CPU side by side, else one after the other."""
     samples = points.shape[0] * points.shape[1]
     count = -(-samples // Computing().together(points.device, samples))
     parts = points.tensor_split(max(1, min(count, points.shape[1])), dim=1)

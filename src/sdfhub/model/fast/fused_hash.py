@@ -21,10 +21,8 @@ from torch.func import functional_call
 
 from sdfhub.model.encodings import Encoding, Hash
 
-WIDTHS = (1, 2, 4, 8)
-"""Features a level that tiny-cuda-nn has kernels for."""
-PROBES, TOLERANCE = 4096, 1e-3
-"""Points at which a twin must agree with the tensor operations, and how far they may differ, relatively."""
+WIDTHS = (1, 2, 4, 8)  # features a level that tiny-cuda-nn has kernels for
+PROBES, TOLERANCE = 4096, 1e-3  # points at which a twin must agree, and how far it may differ, relatively
 
 
 class FusedHash(Encoding):

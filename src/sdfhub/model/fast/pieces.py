@@ -7,21 +7,19 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from sdfhub.model.dropout import drawn_from
 from sdfhub.model.fast.side_by_side import side_by_side
 from sdfhub.shapes import Batch
 
-Parts = dict[str, Tensor]
-"""Weighted terms of the loss by name; their sum is the loss."""
+Parts = dict[str, Tensor]  # weighted terms of the loss by name; their sum is the loss
+Share = Sequence[Callable[[], Parts]]  # the pieces of one thread
 
 
 def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
-    """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals.
-
-    They are of several whole shapes where those fit, else parts of one shape.
-    """
+    """Batches of at most `points` samples that make up a batch, with their shares of samples and of normals:
+    of several whole shapes where those fit, else parts of one shape."""
     shapes, samples = batch.sdf.shape
     surface = max(1, batch.surface_points.shape[1])
     together, cuts = max(1, points // samples), -(-samples // points)
@@ -35,24 +33,13 @@ def pieces(batch: Batch, points: int) -> Iterator[tuple[Batch, float, float]]:
 
 
 def loss_in_pieces(
-    parts_of: Callable[[Batch], Parts],
-    batch: Batch,
-    points: int,
-    parameters: Sequence[nn.Parameter],
-    threads: int = 1,
+    parts_of: Callable[[Batch], Parts], batch: Batch, points: int, learned: Sequence[Tensor], threads: int = 1
 ) -> tuple[Tensor, Parts]:
     """The loss of a batch and its parts; the plain twin is `parts_of(batch)`.
 
-    A batch of more than `points` samples is differentiated in here, piece by piece; `backward` only has to
-    hand the sum over.
-
-    Args:
-        parts_of: the weighted parts of a batch: means over surface points for one named `normal`, else over
-            samples or shapes. Called from all threads.
-        batch: to be split.
-        points: samples that are worked on together, >= 1.
-        parameters: what the loss is differentiated by.
-        threads: each differentiates pieces of its own, >= 1.
+    A batch of more than `points` samples is differentiated by what is learned in here, piece by piece, by
+    each thread pieces of its own; `backward` only hands the sum over. Parts are weighted means: over surface
+    points the one named `normal`, else over samples or shapes.
     """
     if batch.sdf.numel() <= points:
         parts = parts_of(batch)
@@ -69,17 +56,15 @@ def loss_in_pieces(
     calls = [partial(weighted, *piece, seed) for piece, seed in zip(cut, seeds, strict=True)]
     shares = [share for thread in range(threads) if (share := calls[thread::threads])]
     totals: Parts = {}
-    return _Summed.apply(shares, totals, *parameters), totals
+    return _Summed.apply(shares, totals, *learned), totals
 
 
 class _Summed(torch.autograd.Function):
     """The sum of losses, differentiated while it is summed, so that one graph a thread lives at a time."""
 
     @staticmethod
-    def forward(
-        ctx, shares: Sequence[Sequence[Callable[[], Parts]]], totals: Parts, *parameters: Tensor
-    ) -> Tensor:
-        sums = side_by_side(lambda share: _differentiated(share, parameters), shares)
+    def forward(ctx, shares: Sequence[Share], totals: Parts, *learned: Tensor) -> Tensor:
+        sums = side_by_side(lambda share: _differentiated(share, learned), shares)
         (parts, ctx.gradients), *rest = sums
         totals.update(parts)
         for parts, gradients in rest:
@@ -93,18 +78,16 @@ class _Summed(torch.autograd.Function):
         return None, None, *torch._foreach_mul(ctx.gradients, by_loss)
 
 
-def _differentiated(
-    share: Sequence[Callable[[], Parts]], parameters: Sequence[Tensor]
-) -> tuple[Parts, list[Tensor]]:
+def _differentiated(share: Share, learned: Sequence[Tensor]) -> tuple[Parts, list[Tensor]]:
     """Sums of the parts of the loss over pieces, and its gradient, one piece after the other."""
     totals: Parts = {}
-    gradients = [torch.zeros_like(parameter) for parameter in parameters]
+    gradients = [torch.zeros_like(parameter) for parameter in learned]
     for parts_of_piece in share:
         with torch.enable_grad():
             parts = parts_of_piece()
             loss = torch.stack(tuple(parts.values())).sum()
         with torch.autocast(loss.device.type, enabled=False):  # as Lightning calls backward
-            torch._foreach_add_(gradients, torch.autograd.grad(loss, parameters, materialize_grads=True))
+            torch._foreach_add_(gradients, torch.autograd.grad(loss, learned, materialize_grads=True))
         for name, part in parts.items():
             totals[name] = totals.get(name, torch.zeros_like(part)) + part.detach()
     return totals, gradients

@@ -1,7 +1,7 @@
 """Parts of a computation that need nothing of one another, side by side on the cores of a processor.
 
-PyTorch spreads every operation over its threads, which wait for one another after each: hundreds of times in
-a training step. Whole parts, each computed by one thread alone, wait once, at the end.
+PyTorch spreads every operation over its threads, which wait for one another hundreds of times in a training
+step. Whole parts, each computed by one thread alone, wait once, at the end.
 """
 
 import os
@@ -16,25 +16,16 @@ import torch
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+# threads first call MKL's vector functions in turn: of two at once, one had sines good to a ten-thousandth
 _FIRST = Lock()
-"""Threads call MKL's vector functions for the first time in turn: of two that did so at once, one had sines
-good to a ten-thousandth, once in some hundred processes."""
 
 
 def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: int = 2) -> list[Result]:
-    """`work` of every item, in order, on as many threads as PyTorch has here.
+    """`work` of every item, in order, on as many threads as PyTorch has here, in the caller's modes.
 
-    Gradients, inference mode and autocast are on or off as for the caller. Where there is one thread, and
-    inside of `work`, it is a plain loop.
-
-    Args:
-        work: called from several threads at once.
-        items: what it is called with.
-        least: items that are worth it; fewer are a plain loop, in which an operation has all threads. With 1
-            a result does not depend, not even by rounding, on how many items there are.
-
-    Raises:
-        whatever the first item to fail raises; no thread is then at work, and those not begun are left out.
+    Where there is one thread, inside of `work`, or below `least` items it is a plain loop; with 1 a result
+    does not depend, not even by rounding, on how many items there are. When the first item to fail raises,
+    no thread is at work, and those not begun are left out.
     """
     threads = torch.get_num_threads()
     if threads < 2 or len(items) < least:
@@ -46,8 +37,7 @@ def side_by_side(work: Callable[[Item], Result], items: Sequence[Item], least: i
         with torch.inference_mode(inference), torch.set_grad_enabled(grads), torch.autocast("cpu", *autocast):
             return work(item)
 
-    pool = _pool(threads)
-    futures = [pool.submit(call, item) for item in items]
+    futures = [_pool(threads).submit(call, item) for item in items]
     try:
         wait(futures, return_when=FIRST_EXCEPTION)
     finally:

@@ -1,12 +1,11 @@
 """sin(omega x) and tanh(beta sin(omega x)) in float32 on the CPU: one pass over memory forward, one backward.
 
-As tensor operations an activation and its gradient are some thirty passes. numba compiles the loops when they
-are first used (seconds) and keeps them on disk. Backward recomputes from the product: nothing else is kept.
+As tensor operations they are some thirty passes. numba compiles the loops when they are first used (seconds)
+and keeps them on disk. Backward recomputes from the product: nothing else is kept.
 
 Sines are polynomials fitted by least squares at Chebyshev nodes, errors below 1e-6 for angles omega x up to
-2e6; beyond 2e7, where float32 numbers lie a radian apart, nothing is bounded. A hyperbolic tangent is a ratio
-of two polynomials with the least largest error, and 1 from 9 on: an approximation that kept away from 1 would
-have slopes where HOSC is flat.
+2e6; beyond 2e7 nothing is bounded. A hyperbolic tangent is a ratio of two polynomials with the least largest
+error, and 1 from 9 on: an approximation that kept away from 1 would have slopes where HOSC is flat.
 """
 
 from collections.abc import Callable
@@ -22,14 +21,9 @@ from torch import Tensor
 from sdfhub.model.activations import Activation, Hosc, Siren
 from sdfhub.model.fast.side_by_side import side_by_side
 
-ROWS = 128
-"""Points of one shape that are added up together: a longer sum of float32 numbers loses digits."""
-
-ALONE = 2**17
-"""Numbers that one thread works through sooner than it wakes another."""
-
-FAST = {"contract", "nsz", "arcp"}
-"""What a compiler may change. Without "nnan" a diverged training shows; "reassoc" would undo careful sums."""
+ROWS = 128  # points of one shape that are added up together: a longer sum of float32 numbers loses digits
+ALONE = 2**17  # numbers that one thread works through sooner than it wakes another
+FAST = {"contract", "nsz", "arcp"}  # without "nnan" divergence shows; "reassoc" would undo careful sums
 
 _loop = numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)  # Python's checks divisions
 _inlined = numba.njit(inline="always", fastmath=FAST)
@@ -110,9 +104,7 @@ def _chunks(product: Tensor) -> int:
     return product.shape[0] * -(-product.shape[1] // ROWS)
 
 
-def _run(
-    kernel: Callable, product: Tensor, shift: Tensor, log_beta: Tensor | None, omega: float, *arrays
-) -> None:
+def _run(kernel: Callable, product: Tensor, shift: Tensor, log_beta: Tensor | None, omega, *arrays) -> None:
     """Runs a loop over the chunks of a product, on as many threads as PyTorch has."""
     beta = None if log_beta is None else _f(log_beta.exp().item())
     given = _flat(product), _flat(shift), product.shape[1], _f(omega), beta
