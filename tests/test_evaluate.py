@@ -11,8 +11,8 @@ import trimesh
 
 from sdfhub.evaluation import judging
 from sdfhub.evaluation.judging import Evaluation, judge_all
-from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, table, write_scores
-from sdfhub.geometry.metrics import judge
+from sdfhub.evaluation.scoresheet import Judged, table, write_scores
+from sdfhub.geometry.metrics import DistanceMetrics, judge
 from sdfhub.latent.gauss_newton import GaussNewtonFit
 from sdfhub.shapes import Frame, Mesh
 from tests.test_metrics import EMPTY, icosphere, truth

@@ -172,11 +172,8 @@ def test_without_its_split_shapes_are_numbered_and_another_split_can_be_given(co
 
 
 REFUSED = {
-    "norm_layers": {"weight_norm": False},
     "use_tanh": {"use_tanh": True},
-    "different widths": {"dims": [W, W, W, W, W + 1]},
     "geom_dimension": {"geom_dimension": 2},
-    "latent_in": {"latent_in": [0]},
 }
 
 
@@ -211,19 +208,35 @@ def test_files_that_are_missing_or_broken_are_named(config, tmp_path):
     assert "not an experiment of DeepSDF's" in refusal(config, tmp_path)
 
 
-OTHERS = {
-    "lacks 'lin6.bias'": {"dims": [W] * 6, "latent_in": [3]},
-    "has lin5": {"dims": [W] * 4},
-    "another model": {"latent_in": [2]},
-}
+OTHERS = [
+    ("lacks 'lin6.bias'", {"dims": [W] * 6, "latent_in": [3]}),
+    ("has lin5", {"dims": [W] * 4}),
+    ("another model", {"latent_in": [2]}),
+    ("another model", {"dims": [W, W, W, W, W + 1]}),
+    ("layers 1 to 5", {"latent_in": [0]}),
+    ("layers 1 to 5", {"latent_in": [6]}),
+]
 
 
-@pytest.mark.parametrize("message", OTHERS)
-def test_parameters_of_another_decoder_are_refused(message, config, tmp_path):
+@pytest.mark.parametrize(("message", "network"), OTHERS)
+def test_parameters_of_another_decoder_are_refused(message, network, config, tmp_path):
+    if network.get("dims", [W])[-1] != W:  # layers of different widths, which ours cannot have
+        write_experiment(tmp_path, **network)
+        assert message in refusal(config, tmp_path)
+        return
     specs, _, _ = write_experiment(tmp_path)
-    changed = specs | {"NetworkSpecs": specs["NetworkSpecs"] | OTHERS[message]}
+    changed = specs | {"NetworkSpecs": specs["NetworkSpecs"] | network}
     (tmp_path / "examples" / "balls" / "specs.json").write_text(json.dumps(changed))
     assert message in refusal(config, tmp_path)
+
+
+def test_layer_norms_are_refused(config, tmp_path):
+    write_experiment(tmp_path, weight_norm=False)
+    path = tmp_path / "examples/balls/ModelParameters/latest.pth"
+    content = torch.load(path)
+    content["model_state_dict"]["module.bn0.weight"] = torch.ones(W)
+    torch.save(content, path)
+    assert "has bn0.weight" in refusal(config, tmp_path)
 
 
 def test_importing_runs_no_code_of_the_experiment(config, tmp_path):

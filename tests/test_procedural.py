@@ -1,6 +1,5 @@
 """Properties of the procedural shapes: closed solids, repeatable, distinct, moved by every parameter."""
 
-from dataclasses import astuple, fields, replace
 from functools import cache
 
 import numpy as np
@@ -59,37 +58,38 @@ def test_an_index_always_gives_the_same_shape(meshes, category):
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_a_thousand_designs_are_distinct_and_within_their_ranges(category):
     designs = [design(category, i) for i in range(1000)]
-    assert len({astuple(d) for d in designs}) == 1000
-    for f in fields(designs[0]):
-        values = [getattr(d, f.name) for d in designs]
-        if "range" in f.metadata:
-            low, high = f.metadata["range"]
-            assert low <= min(values) and max(values) <= high
+    assert len({tuple(vars(d).values()) for d in designs}) == 1000
+    for name, domain in designs[0].parameters.items():
+        values = [getattr(d, name) for d in designs]
+        if isinstance(domain, tuple):
+            assert domain[0] <= min(values) and max(values) <= domain[1]
         else:
-            assert set(values) == set(f.metadata["options"])
+            assert set(values) == set(domain)
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_every_parameter_moves_the_shape(category):
-    for f in fields(design(category, 0)):
-        assert any(_moves(category, i, f) for i in range(120)), f"{category}.{f.name} changes nothing"
+    for name in design(category, 0).parameters:
+        assert any(_moves(category, i, name) for i in range(120)), f"{category}.{name} changes nothing"
 
 
 @cache
-def _measures(chosen) -> tuple[float, int]:
+def _measures(category: str, index: int, **changed) -> tuple[float, int]:
+    chosen = design(category, index)
+    vars(chosen).update(changed)
     solid = chosen.build()
     return solid.volume(), solid.num_tri()
 
 
-def _moves(category: str, index: int, f) -> bool:
-    """Whether another value of one field gives this design another solid."""
+def _moves(category: str, index: int, name: str) -> bool:
+    """Whether another value of one parameter gives this design another solid."""
     chosen = design(category, index)
-    value = getattr(chosen, f.name)
-    if "range" in f.metadata:
-        other = max(f.metadata["range"], key=lambda end: abs(end - value))
+    value, domain = getattr(chosen, name), chosen.parameters[name]
+    if isinstance(domain, tuple):
+        other = max(domain, key=lambda end: abs(end - value))
     else:
-        other = next(option for option in f.metadata["options"] if option != value)
-    before, after = _measures(chosen), _measures(replace(chosen, **{f.name: other}))
+        other = next(option for option in domain if option != value)
+    before, after = _measures(category, index), _measures(category, index, **{name: other})
     return abs(before[0] - after[0]) > 1e-9 or before[1] != after[1]
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from hydra.types import RunMode
 
-from sdfhub.multirun.cells import finished
-from sdfhub.multirun.sweep import planned_cells
+from sdfhub.multirun.sweep import finished, planned_cells
 from sdfhub.report.results import Cell, PlannedCell, read_sweep
 from sdfhub.report.rows import group_cells
 from tests.stand_in_training import CONF, of_multirun, stand_in

@@ -6,8 +6,8 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from sdfhub.tasks import words
-from sdfhub.tasks.words import words_to_overrides
+from sdfhub.tasks import app
+from sdfhub.tasks.app import words_to_overrides
 
 PATHS = [
     "a b",
@@ -82,5 +82,5 @@ def test_words_take_their_names_in_order_and_the_rest_is_left_alone(tmp_path):
 
 
 def test_the_example_runs():
-    failed, tried = doctest.testmod(words)
+    failed, tried = doctest.testmod(app)
     assert tried and not failed

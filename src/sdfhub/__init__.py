@@ -10,7 +10,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 __version__ = version("sdfhub")
 
-_MODULES = {
+_MODULES = {  # of public names, imported when they are first asked for: not all need PyTorch
     "Activation": "sdfhub.model.activations",
     "AutoDecoder": "sdfhub.model.autodecoder",
     "Decoder": "sdfhub.model.decoder",
@@ -28,8 +28,6 @@ _MODULES = {
     "prepare_mesh": "sdfhub.data.preparation.sampling",
     "train": "sdfhub.training",
 }
-"""Where public names live. They are imported when they are first asked for: not all need PyTorch."""
-
 __all__ = sorted(_MODULES)
 
 

@@ -1,8 +1,7 @@
 """Objects as plain data and back: what a checkpoint, an export and a config say of a model.
 
 A description is a mapping with `_target_`, the dotted path of a class, and the arguments of its constructor,
-as in a Hydra config; `_partial_` marks a factory. For one that comes from a file only classes of sdfhub and
-of packages that the caller trusts are imported.
+as in a Hydra config; `_partial_` marks a factory.
 """
 
 import contextlib
@@ -28,21 +27,19 @@ class Described:
 
     def __init_subclass__(cls, **settings: Any):
         super().__init_subclass__(**settings)
-        if "__init__" in vars(cls):
-            cls.__init__ = _remembering(cls.__init__)  # type: ignore[method-assign]
+        if "__init__" not in vars(cls):
+            return
+        initialise: Any = cls.__init__
+        signature = inspect.signature(initialise)
 
+        @functools.wraps(initialise)
+        def remember(self, *arguments: Any, **named: Any) -> None:
+            given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
+            check_arguments(initialise, given, type(self).__name__)
+            self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
+            initialise(self, *arguments, **named)
 
-def _remembering(initialise: Callable) -> Callable:
-    signature = inspect.signature(initialise)
-
-    @functools.wraps(initialise)
-    def remember(self, *arguments: Any, **named: Any) -> None:
-        given = dict(list(signature.bind(self, *arguments, **named).arguments.items())[1:])
-        check_arguments(initialise, given, type(self).__name__)
-        self.__dict__.setdefault("_arguments", given)  # those of a class below this one came first
-        initialise(self, *arguments, **named)
-
-    return remember
+        cls.__init__ = typing.cast(Any, remember)  # type: ignore[method-assign]
 
 
 def describe(value: Any, key: str = "") -> Any:
@@ -65,8 +62,9 @@ def describe(value: Any, key: str = "") -> Any:
     elif isinstance(value, Described):
         arguments = vars(value).get("_arguments", {})
     else:
-        what = f"{type(value).__module__}.{type(value).__qualname__}"
-        raise SdfhubError(f"{key}: {what} cannot say how it was made; derive it from sdfhub's own class")
+        raise SdfhubError(
+            f"{key}: {_path(type(value))} cannot say how it was made; derive it from sdfhub's own class"
+        )
     return {"_target_": _path(type(value)), **describe(arguments, key)}
 
 
@@ -75,8 +73,7 @@ def _path(kind: Callable) -> str:
 
 
 def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "sdfhub") -> Any:
-    """The object of a description that comes from a file: its classes are of the package `within` or of those
-    in `trust`, its arguments are checked. Mappings with `_target_` become objects, wherever they stand."""
+    """The object of a description from a file; its classes are of the packages `within` and `trust`."""
     if isinstance(node, list):
         return [built(item, key, trust, within) for item in node]
     if not isinstance(node, Mapping):
@@ -96,7 +93,7 @@ def built(node: Any, key: str, trust: str | Sequence[str] = (), within: str = "s
 
 
 def trusted_packages(trust: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The names of trusted packages from one name, several, or text such as `mypkg,other`."""
+    """Names from one name, several, or text such as `mypkg,other`."""
     names = trust.split(",") if isinstance(trust, str) else list(trust or ())
     return tuple(name.strip() for name in names if name.strip())
 
@@ -109,8 +106,8 @@ def _trusted(path: Any, key: str, trust: tuple[str, ...], within: str) -> Callab
         target = located(path, key)
         if inspect.isclass(target) and target.__module__.startswith(ours):
             return target
-    hint = f"trust={package} builds it, if you know that package"
-    raise SdfhubError(f"{key}: the file asks for {path!r}, which is no class of {within}; {hint}")
+    wanted = f"{key}: the file asks for {path!r}, which is no class of {within}"
+    raise SdfhubError(f"{wanted}; trust={package} builds it, if you know that package")
 
 
 def located(path: str, key: str) -> Callable:

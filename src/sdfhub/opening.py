@@ -1,15 +1,7 @@
-"""A trained shape space from disk: a run's folder, a checkpoint's run, or one exported file.
+"""A trained shape space from disk: a run's folder, or one exported file.
 
-The border between a user's own words and somebody's file stands here: what a file holds is data. Of its
-descriptions only classes of sdfhub, and of packages that the caller trusts, are built.
-
-A run's folder:
-
-config.yaml       the composed config, interpolations resolved but those of the environment
-split.json        ids of the shapes by role; training ids in the order of the code table
-frames.json       which axis is up, and where the training shapes lie in their sources' frames
-checkpoints/      last.ckpt and others: weights, and the description of the model
-metrics.json, metrics.csv, meshes/, contact_sheet.png, what the loggers write
+What a file holds is data. Of its descriptions only classes of sdfhub and of trusted packages are built.
+In `split.json` training ids are in the order of the code table.
 """
 
 import json
@@ -38,13 +30,11 @@ from sdfhub.whole_file import write_whole
 if TYPE_CHECKING:
     from sdfhub.data.loading import SdfDataModule
 
-FORMAT = "sdfhub space 2"
-"""What an exported file says it is; another number where its content means something else."""
+Ids = Sequence[str]
+FORMAT = "sdfhub space 2"  # of exported files; another number where their content means something else
 
 
-def load(
-    path: str | Path, device: str | torch.device | None = None, trust: str | Sequence[str] = ()
-) -> Space:
+def load(path: str | Path, device: str | torch.device | None = None, trust: str | Ids = ()) -> Space:
     """The trained shape space of a run's folder, or of a file that `sdfhub export` wrote.
 
     Args:
@@ -88,15 +78,14 @@ def write_space(space: Space, path: Path) -> None:
 
 
 def _plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
-    """Centre and scale of frames, four numbers each."""
     return {id: [*map(float, frame.center), float(frame.scale)] for id, frame in frames.items()}
 
 
 def begin_run(
     run: Path,
     config: dict[str, Any],
-    train: Sequence[str],
-    held_out: Sequence[str],
+    train: Ids,
+    held_out: Ids,
     frames: Mapping[str, Frame],
     up: Literal["y", "z"],
 ) -> None:

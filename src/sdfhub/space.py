@@ -41,8 +41,8 @@ from sdfhub.scans.scan import Scan
 from sdfhub.shapes import NORMALIZED, Frame, Observation, check_id
 
 Array = np.ndarray | Tensor
-Shape = str | int | Array
-"""An id, a row of the code table, or a code [L]."""
+Shape = str | int | Array  # an id, a row of the code table, or a code [L]
+ScanFrame = Literal["shape", "normalised"] | Frame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,10 +87,8 @@ class Space:
         if isinstance(shape, str):
             if shape in self.ids:
                 return self.ids.index(shape)
-            near = get_close_matches(shape, self.ids, n=3, cutoff=0)
-            raise SdfhubError(
-                f"this space was not trained on a shape {shape!r}; it has {', '.join(near)} ..."
-            )
+            near = ", ".join(get_close_matches(shape, self.ids, n=3, cutoff=0))
+            raise SdfhubError(f"this space was not trained on a shape {shape!r}; it has {near} ...")
         if isinstance(shape, bool) or not 0 <= shape < len(self.ids):
             raise SdfhubError(f"this space has no row {shape}; its rows are 0 to {len(self.ids) - 1}")
         return int(shape)
@@ -99,14 +97,11 @@ class Space:
         """The code [L] of a shape, or the codes [B, L] of several."""
         if isinstance(shape, str | int | np.integer):
             return self.codes[self.row(shape)]
-        if isinstance(shape, Sequence):
-            if not shape:
-                raise SdfhubError("no shape is named")
+        if isinstance(shape, Sequence) and len(shape):
             return torch.stack([self._single_code(item) for item in shape])
         code, size = self._tensor(shape), self.codes.shape[1]
         if code.dim() not in (1, 2) or code.shape[-1] != size:
-            what = f"an id, a row or a code, an array or tensor of {size} numbers"
-            raise SdfhubError(f"a shape is {what}; got {list(code.shape)}")
+            raise SdfhubError(f"a shape is an id, row or tensor of {size} numbers; got {list(code.shape)}")
         return code
 
     def _single_code(self, shape: Shape) -> Tensor:
@@ -132,17 +127,15 @@ class Space:
             raise SdfhubError(f"sdf takes points [N, 3] of one shape or [B, N, 3] of B shapes, got {what}")
         if not points.numel():
             return points.new_zeros(points.shape[:-1])
-        is_one = points.dim() == 2
-        points, codes = (points[None], codes[None]) if is_one else (points, codes)
+        batch = points.reshape(-1, *points.shape[-2:]), codes.reshape(-1, codes.shape[-1])
         differentiated = torch.is_grad_enabled() and (points.requires_grad or codes.requires_grad)
-        sdf = self.decoder(points, codes) if differentiated else distances(self.decoder, points, codes)
-        return sdf[0] if is_one else sdf
+        sdf = self.decoder(*batch) if differentiated else distances(self.decoder, *batch)
+        return sdf.reshape(points.shape[:-1])
 
     def mesh(self, shape: Shape, resolution: int = 256) -> Mesh:
-        """The surface of a shape, in its source's frame or, where a code has none, the normalised one.
+        """The surface of a shape, [V, 3] and [F, 3], in its source's frame; of a code in the normalised one.
 
-        Vertices [V, 3] float64 and faces [F, 3] int64 from a grid of `resolution` >= 2 points along an axis;
-        V = F = 0 where the field has no zero level.
+        From a grid of `resolution` >= 2 points along an axis; V = F = 0 where the field has no zero level.
         """
         return next(self.meshes([shape], resolution))
 
@@ -160,21 +153,21 @@ class Space:
         points: Array,
         normals: Array | None = None,
         sdf: Array | None = None,
-        frame: Literal["shape", "normalised"] | Frame = "normalised",
+        frame: ScanFrame = "normalised",
         seed: int = 0,
     ) -> Tensor:
         """The code [L] of a shape that the space has not seen, by MAP estimation.
 
         Args:
-            points: [N, 3]: all over the surface where `sdf` is not given.
+            points: [N, 3], all over the surface where `sdf` is not given.
             normals: [N, 3] outward normals of surface points.
             sdf: [N] signed distances at the points, negative inside, of both sides.
-            frame: in which the points lie: normalised; a known one, such as `space.frames[id]`; or shape,
-                where the bounding box of surface points tells it.
+            frame: in which points lie: normalised; a known one, such as `space.frames[id]`; shape, as their
+                bounding box tells.
             seed: of the choice of points.
 
         Raises:
-            SdfhubError: they do not tell a shape; says why.
+            SdfhubError: they do not tell a shape.
         """
         if sdf is not None and normals is not None:
             raise SdfhubError("fit: normals belong to surface points; give them or sdf, not both")
@@ -184,9 +177,7 @@ class Space:
         except (TypeError, ValueError, SdfhubError) as error:
             raise SdfhubError(f"fit: {error}") from error
 
-    def fit_scan(
-        self, scan: Scan, frame: Literal["shape", "normalised"] | Frame = "shape", seed: int = 0
-    ) -> Tensor:
+    def fit_scan(self, scan: Scan, frame: ScanFrame = "shape", seed: int = 0) -> Tensor:
         """The code [L] of a scan from a file or from arrays; frame and seed are as for `fit`."""
         if not isinstance(frame, Frame) and frame not in ("shape", "normalised"):
             raise SdfhubError(f"frame={frame!r}: must be 'shape', 'normalised' or a Frame")
@@ -213,10 +204,7 @@ class Space:
         return [(self.ids[row], value) for value, row in nearest[:k]]
 
     def unusual(self, shape: Shape | Sequence[Shape]) -> Tensor:
-        """How far codes lie from the middle of the known ones, [] or [B]: about 1 for these.
-
-        The squared distance over that of the known ones on average; some 5 to 10 for strangers.
-        """
+        """Squared distances, [] or [B], of codes to the mean of the known ones: of these about 1."""
         codes = self.code(shape)
         return self.distribution.unusual(codes.reshape(-1, codes.shape[-1])).reshape(codes.shape[:-1])
 

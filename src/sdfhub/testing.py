@@ -16,14 +16,14 @@ Pair = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def check_derivatives(make: Any, **settings: Any) -> None:
-    """Checks an activation, an encoding or a conditioning against differences in float64.
+    """Checks an activation, an encoding or a conditioning; an `AssertionError` says what is wrong.
 
-    Values, first derivatives, the derivatives of those by points, codes and weights (which a loss of normals
-    needs), shapes, dtypes and finite numbers. An `AssertionError` says what is wrong.
+    First derivatives, and those of these by points, codes and weights (which a loss of normals needs),
+    against differences in float64; shapes, dtypes, finite numbers.
 
     Args:
-        make: a class, a partial of one, or an instance: an `Activation` or elementwise module, an `Encoding`
-            or module with `features`, or a class of `Layer`.
+        make: a class, a partial or an instance: an `Activation` or elementwise module, an `Encoding` or
+            module with `features`, or a class of `Layer`.
         settings: arguments of the class.
     """
     make = partial(make, **settings) if settings else make

@@ -7,6 +7,7 @@ A logger of your own joins with a line for either: `show_picture.register(MyLogg
 import tempfile
 from functools import singledispatch
 from pathlib import Path
+from typing import Any
 
 import fast_simplification
 import numpy as np
@@ -28,9 +29,7 @@ def show_picture(logger: Logger, name: str, image: np.ndarray, step: int) -> Non
 
 
 @singledispatch
-def show_mesh(
-    logger: Logger, name: str, vertices: np.ndarray, faces: np.ndarray, up: UpAxis, step: int
-) -> None:
+def show_mesh(logger: Logger, name: str, vertices: Any, faces: Any, up: UpAxis, step: int) -> None:
     """Shows a mesh upright: vertices [V, 3], normalised frame, faces [F, 3], F > 0, its upward axis."""
 
 
@@ -44,9 +43,8 @@ def _(logger: TensorBoardLogger, name, vertices, faces, up, step):
     if len(vertices) > TENSORBOARD_VERTICES:
         share = 1 - TENSORBOARD_VERTICES / len(vertices)
         vertices, faces = fast_simplification.simplify(vertices.astype(np.float32), faces, share)
-    vertices, faces = np.asarray(turned_up(vertices, up, "y"), np.float32), np.asarray(faces, np.int32)
-    arrays = torch.from_numpy(vertices)[None], None, torch.from_numpy(faces)[None]
-    logger.experiment.add_mesh(name, *arrays, global_step=step)
+    arrays = torch.from_numpy(turned_up(vertices, up, "y")).float(), torch.from_numpy(faces).int()
+    logger.experiment.add_mesh(name, arrays[0][None], None, arrays[1][None], global_step=step)
 
 
 @show_picture.register
@@ -56,23 +54,9 @@ def _(logger: CSVLogger, name, image, step):
     Image.fromarray(image).save(path)
 
 
-@show_mesh.register
-def _(logger: CSVLogger, name, vertices, faces, up, step):
-    write_row([Mesh(vertices, faces)], up, Path(logger.log_dir) / name / f"{step:08d}.glb")
-
-
 @show_picture.register
 def _(logger: WandbLogger, name, image, step):
     logger.log_image(name, [image], step)
-
-
-@show_mesh.register
-def _(logger: WandbLogger, name, vertices, faces, up, step):
-    import wandb  # an extra
-
-    with tempfile.TemporaryDirectory() as folder:
-        write_row([Mesh(vertices, faces)], up, path := Path(folder) / "mesh.glb")
-        logger.log_metrics({name: wandb.Object3D(str(path))}, step)  # type: ignore[dict-item]  # copies the file
 
 
 @show_picture.register
@@ -81,7 +65,13 @@ def _(logger: MLFlowLogger, name, image, step):
 
 
 @show_mesh.register
-def _(logger: MLFlowLogger, name, vertices, faces, up, step):
-    with tempfile.TemporaryDirectory() as folder:
-        write_row([Mesh(vertices, faces)], up, path := Path(folder) / f"{step:08d}.glb")
-        logger.experiment.log_artifact(logger.run_id, str(path), artifact_path=name)
+def _(logger: CSVLogger | WandbLogger | MLFlowLogger, name, vertices, faces, up, step):
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(logger.log_dir) / name if isinstance(logger, CSVLogger) else Path(scratch)
+        write_row([Mesh(vertices, faces)], up, path := folder / f"{step:08d}.glb")
+        if isinstance(logger, MLFlowLogger):
+            logger.experiment.log_artifact(logger.run_id, str(path), artifact_path=name)
+        elif isinstance(logger, WandbLogger):
+            import wandb  # an extra
+
+            logger.log_metrics({name: wandb.Object3D(str(path))}, step)  # type: ignore[dict-item]  # a copy

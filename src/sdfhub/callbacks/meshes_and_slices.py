@@ -17,7 +17,7 @@ from sdfhub.geometry.metrics import ShapeMetrics, judge
 from sdfhub.geometry.render import render, slice_image
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.fast.computing import distances
-from sdfhub.shapes import Mesh, NormalizedMesh
+from sdfhub.shapes import Mesh
 from sdfhub.space import reconstruct
 
 METRICS = {"cd": 1e3, "excess": 1e3, "normal_consistency": 1.0, "f_score": 1.0}
@@ -30,8 +30,8 @@ GridSize = Annotated[int, Field(ge=2)]
 class ShapesShown(L.Callback):
     """Shows the first training shapes several times, evenly over a training, the last time its final state.
 
-    The steps depend on the training's length alone, so a continued training shows the same ones. The record
-    of the training does not count the seconds spent here. Subclasses write `show`.
+    A continued training shows the same steps. The record of the training does not count the seconds spent
+    here. Subclasses write `show`.
     """
 
     def __init__(self, times: Count = 8, shapes: Count = 2):
@@ -64,10 +64,8 @@ class ShapesShown(L.Callback):
 class MeshShapes(ShapesShown):
     """Meshes the first training shapes, shows them beside the truth and logs `mesh/cd` and other metrics.
 
-    Shapes without a true mesh are skipped. A field without a surface counts in `mesh/failed`.
-
-    Args:
-        resolution, points: along an axis of the marching-cubes grid; a side of the Chamfer distance.
+    Shapes without a true mesh are skipped. A field without a surface counts in `mesh/failed`. `resolution`
+    counts points along an axis of the marching-cubes grid, `points` those a side of the Chamfer distance.
     """
 
     def __init__(
@@ -88,7 +86,7 @@ class MeshShapes(ShapesShown):
             logger.log_metrics(values, trainer.global_step)
 
     def _show_shape(
-        self, trainer: L.Trainer, module: AutoDecoder, shape: StoredShape, code: Tensor, truth: NormalizedMesh
+        self, trainer: L.Trainer, module: Any, shape: Any, code: Tensor, truth: Any
     ) -> ShapeMetrics:
         try:
             mesh = next(reconstruct(module.decoder, code[None], self.resolution))

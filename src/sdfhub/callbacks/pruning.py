@@ -15,12 +15,8 @@ class OptunaPruning(L.Callback):
     """Reports a metric to a search's study at each validation; stops the training if the pruner says so.
 
     What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's
-    sweeper hands no trial on: it is the newest running one with the training's parameters.
-
-    Args:
-        storage, study: URL of the study's database, and its name there.
-        overrides: of this training, `key=value`.
-        pruner, monitor: what decides, and the name of the metric, which is minimised.
+    sweeper hands no trial on: it is the newest running one with the training's `overrides`, `key=value`.
+    `storage` is the URL of the database of the `study`; `monitor` names the metric, which is minimised.
     """
 
     def __init__(

@@ -19,9 +19,9 @@ from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape, draw_rows
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import SdfhubError
-from sdfhub.evaluation.scoresheet import DistanceMetrics, Judged, write_scores
+from sdfhub.evaluation.scoresheet import Judged, write_scores
 from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.metrics import judge_pair
+from sdfhub.geometry.metrics import DistanceMetrics, judge_pair
 from sdfhub.geometry.render import render
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
@@ -33,12 +33,8 @@ from sdfhub.space import reconstruct
 log = logging.getLogger(__name__)
 
 WORTH_A_PROCESS = 4  # shapes to judge: a worker takes as long to start as to judge one or two
-NOISE = 64
-"""Faces, in squared resolutions, above which a mesh is noise: ten times those of the unit sphere. What a
-training that diverged leaves crosses zero in every cell: it is no surface, and would take gigabytes."""
-
-Role = tuple[str, StoredShape, Tensor]
-"""Role, shape and code [L]."""
+NOISE = 64  # faces, in squared resolutions, above which a field is noise: ten times those of the unit sphere
+Role = tuple[str, StoredShape, Tensor]  # role, shape and code [L]
 
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
@@ -66,30 +62,28 @@ def evaluate_model(
     out: Path,
     training: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Judges training and held-out shapes; writes tables, meshes and pictures below `out`.
+    """Judges training shapes, by rows of the codes [S, L], and held-out ones; writes and gives the scores.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Training shapes are
-    named by their rows of the codes [S, L]; codes of others are fitted under the training's clamp `delta`.
-    Returned is what `metrics.json` holds, plain numbers about the training included.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Codes of held-out shapes
+    are fitted under the clamp `delta`. `training` is plain data for `metrics.json`.
     """
     decoder.eval()
-    roles: list[Role]
-    roles = [("train", shape, codes[row]) for row, shape in list(train.items())[: evaluation.train]]
+    known = list(train.items())[: evaluation.train]
+    roles: list[Role] = [("train", shape, codes[row]) for row, shape in known]
     if unseen := list(held_out)[: evaluation.held_out]:
         fitted = fit_held_out(decoder, codes, delta, unseen, evaluation)
         roles += [("held_out", shape, code) for shape, code in zip(unseen, fitted, strict=True)]
     if all(shape.mesh is not None for _, shape, _ in roles):
         judged = judge_all(decoder, roles, evaluation, out)
     else:
-        scores = [distance_metrics(decoder, code, shape, delta) for _, shape, code in roles]
-        judged = [Judged(role, shape, row) for (role, shape, _), row in zip(roles, scores, strict=True)]
+        judged = [Judged(role, s, distance_metrics(decoder, code, s, delta)) for role, s, code in roles]
     return write_scores(judged, evaluation, training, out)
 
 
 def fit_held_out(
     decoder: Decoder, codes: Tensor, delta: float, shapes: Sequence[StoredShape], evaluation: Evaluation
 ) -> Tensor:
-    """Codes [S, L] of shapes that were never trained on, from their signed samples."""
+    """Codes [S, L] of shapes from their signed samples."""
     fitted = []
     for start in range(0, len(shapes), evaluation.fit_together):
         group = shapes[start : start + evaluation.fit_together]
@@ -100,11 +94,7 @@ def fit_held_out(
 
 
 def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, out: Path) -> list[Judged]:
-    """Reconstructs shapes with meshes one after another, while worker processes judge those before.
-
-    A mesh is written to `out`/meshes, in its source's frame, and drawn when it is made, and not kept: a
-    thousand would not fit into memory.
-    """
+    """Meshes, writes and draws shapes one by one, and keeps no mesh, while workers judge those before."""
     pictures: list[tuple[np.ndarray, np.ndarray | str] | None] = []
     of_role = Counter[str]()
 
@@ -117,11 +107,11 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
             path, truth = out / "meshes" / role / f"{shape.id}.ply", cast(NormalizedMesh, shape.mesh)
             write_mesh(shape.frame.to_source(vertices), faces, path)
             of_role[role] += 1
-            pair = None
+            drawn = None
             if of_role[role] <= evaluation.pictures:
-                drawn = render(vertices, faces, up=shape.up) if len(faces) else "no surface"
-                pair = render(truth.vertices, truth.faces, up=shape.up), drawn
-            pictures.append(pair)
+                own = render(vertices, faces, up=shape.up) if len(faces) else "no surface"
+                drawn = render(truth.vertices, truth.faces, up=shape.up), own
+            pictures.append(drawn)
             yield Mesh(vertices, faces), truth
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from sdfhub.data.store.stored_shape import StoredShape
-from sdfhub.geometry.metrics import STATISTICS, ShapeMetrics, summarize
+from sdfhub.geometry.metrics import DistanceMetrics, ShapeMetrics, summarize
 from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-COLUMNS = {
+COLUMNS = {  # of the printed table: headings and factors; files carry all metrics, without factors
     "cd": ("CD x10^3", 1e3),
     "floor": ("floor", 1e3),
     "excess": ("excess", 1e3),
@@ -26,22 +26,13 @@ COLUMNS = {
     "sdf_error": ("|f-d| x10^3", 1e3),
     "sign_accuracy": ("signs right", 1),
 }
-"""Metrics of the printed table, their headings and factors; the files carry all of them, without factors."""
 
 TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
 
 
 @dataclass(frozen=True)
-class DistanceMetrics:
-    """The judgement of a field where the source has no mesh."""
-
-    sdf_error: float  # mean |f - d| over samples with |d| < delta, normalised units
-    sign_accuracy: float  # share of samples on the right side
-
-
-@dataclass(frozen=True)
 class Judged:
-    """One judged shape: who it is, how good it is and, where it is on the sheet, what it looks like."""
+    """One judged shape; `pictures` of those on the contact sheet."""
 
     role: str  # `train` or `held_out`
     shape: StoredShape
@@ -54,40 +45,26 @@ def write_scores(
 ) -> dict[str, Any]:
     """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
 
-    Returns what `metrics.json` holds: the settings (a dataclass), plain numbers about the training and, per
-    role, a `summary` and the rows of its `shapes`, in the order in which they were judged.
+    Returns what `metrics.json` holds: settings, numbers about the training, a role's `summary` and `shapes`.
     """
     import pandas  # here: slow to import, and every training would wait for it before its first step
 
     result: dict[str, Any] = {"evaluation": asdict(evaluation), "training": training}
     for role, rows in _by_role(judged).items():
         shapes = [{"id": row.shape.id, **asdict(row.metrics)} for row in rows]
-        result[role] = {"summary": _summary([row.metrics for row in rows]), "shapes": shapes}
+        result[role] = {"summary": summarize([row.metrics for row in rows]), "shapes": shapes}
     table_rows = [{"role": row.role, "id": row.shape.id, **asdict(row.metrics)} for row in judged]
     write_whole(out / "metrics.csv", pandas.DataFrame(table_rows).to_csv(index=False))
     log.info(table(judged))
     if any(isinstance(row.metrics, DistanceMetrics) for row in judged):
         log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
     if pictures := [row.pictures for row in judged if row.pictures]:
-        captions, labels = (
-            [_caption(row) for row in judged if row.pictures],
-            ["ground truth", "reconstruction"],
-        )
+        captions = [_caption(row) for row in judged if row.pictures]
+        labels = ["ground truth", "reconstruction"]
         contact_sheet(list(zip(*pictures, strict=True)), labels, captions, out / "contact_sheet.png")
-    # last: a run that has it is finished
-    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))
+    write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))  # last: the run is finished
     log.info("\nscores, meshes and contact sheet: %s", out)
     return result
-
-
-def _summary(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, Any]:
-    judged = [row for row in metrics if isinstance(row, ShapeMetrics)]
-    if len(judged) == len(metrics):
-        return summarize(judged)
-    values = {name: [getattr(row, name) for row in metrics] for name in asdict(metrics[0])}
-    return {
-        name: {key: float(of(column)) for key, of in STATISTICS.items()} for name, column in values.items()
-    }
 
 
 def table(judged: Sequence[Judged]) -> str:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class Validation:
     """Scores a training shape with its own code, or a held-out one with a code fitted to its samples.
 
-    It is coarse, to cost little: good for comparing states of one training, not for tables. The same samples
-    are drawn every time. It changes neither weights nor random states of a training.
+    Coarse and cheap: for states of one training, not for tables. It draws the same samples every time, and
+    changes neither weights nor random states.
     """
 
     fit: SkipValidation[Fit]  # finds the codes of held-out shapes
@@ -39,9 +39,8 @@ class Validation:
     def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
         """The scores of one shape, from a decoder in evaluation mode and codes [S, L].
 
-        `sdf_error`: mean |f - d| over samples with |d| < delta, normalised units. `cd`: Chamfer distance
-        times 10^3, squared normalised units, where the shape has a mesh. A reconstruction without surface
-        counts as one point at the origin, far worse than any other, so that monitors have a number.
+        `sdf_error`: mean |f - d| over samples with |d| < delta. `cd`: Chamfer distance times 10^3, where the
+        shape has a mesh; without a surface that of one point at the origin, so that monitors have a number.
         """
         rows = signed_samples(item.shape, self.fit.samples or self.points, np.random.default_rng(self.seed))
         with torch.inference_mode(False), torch.no_grad():  # fits need derivatives

@@ -2,7 +2,7 @@
 
 A *cell* of stride s spans s grid steps; a *block* is a cell of stride 2, the finest thing that is skipped.
 Cells are rows [shape, i, j, k], sampled at their *centres*, s / 2 steps above the lowest corner. Slopes are
-per grid step.
+per grid step. The state of a node is positive outside, negative inside, 0 where it is unknown.
 
 A centre with the value f decides the sign of every node within |f| / L steps, where L bounds the slope of the
 field in the cell; a cell whose nodes are all decided is skipped. Of the blocks left, only nodes that no block
@@ -26,7 +26,7 @@ SAFETY = 1.25  # factor on the measured slopes; a larger one misses less and eva
 _SMALL = 16  # below this many nodes per axis a coarse level says nothing
 _NEAR = 0.05  # share of the coarse samples, those nearest to zero, that set the least slope
 _CHILDREN = np.indices((1, 2, 2, 2)).reshape(4, 8).T
-_OUTSIDE, _INFERRED, _EVALUATED = 1, 2, 4  # state of a node, as bits; 0: unknown
+_INFERRED, _EVALUATED = 1, 2  # sizes of the states of nodes
 
 
 class SampledCells(NamedTuple):
@@ -40,7 +40,6 @@ class SampledCells(NamedTuple):
         return SampledCells(*(array[mask] for array in self))
 
     def candidates(self, stride: int) -> "SampledCells":
-        """The cells that may hold the surface."""
         return self.where(~self.decides(stride * np.sqrt(3) / 2))
 
     def decides(self, distance: float) -> np.ndarray:
@@ -67,23 +66,22 @@ def sample_blocks(grid: Grid) -> SampledCells:
 def evaluate_crossed_cells(grid: Grid, sampled: SampledCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The cells of stride 1 on which the sign changes: candidates grow until no sign change leaves them.
 
-    Gives keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once and in no
-    order; and the values [K] float32.
+    Keys [M] of the cells' lowest nodes; keys [K] of nodes, theirs among them, each once; values [K].
     """
     blocks = sampled.candidates(2).cells
     states = _inferred_states(grid, sampled)
     active = np.zeros((len(grid.shapes), *[grid.n // 2] * 3), bool)
     samples = [(_centre_keys(sampled.cells, 2, grid.n), sampled.values)]
     crossed: list[np.ndarray] = [np.empty(0, grid.integers)]
-    states[samples[0][0]] = _evaluated_states(sampled.values)
+    states[samples[0][0]] = _states(sampled.values, _EVALUATED)
     while len(blocks):
         active[tuple(blocks.T)] = True
         nodes = _node_keys(blocks, 2, range(3), grid.n)
         _evaluate(grid, nodes[states[nodes] == 0], states, samples)
-        outside = (states[nodes] & _OUTSIDE) > 0
+        outside = states[nodes] > 0
         marks = _crossed_cells(outside, nodes, grid.n)
         cells, surface = nodes[:, :2, :2, :2][marks], marks.any(axis=(1, 2, 3))
-        corners = np.concatenate([cells + _distance(corner, grid.n) for corner in _CHILDREN[:, 1:]])
+        corners = np.concatenate([cells + int(c @ [grid.n**2, grid.n, 1]) for c in _CHILDREN[:, 1:]])
         if _evaluate(grid, corners, states, samples):
             blocks, crossed = np.argwhere(active).astype(grid.integers), crossed[:1]
         else:
@@ -98,19 +96,14 @@ def _inferred_states(grid: Grid, sampled: SampledCells) -> np.ndarray:
     states = np.zeros(len(grid.shapes) * grid.n**3, np.int8)
     sampled = sampled.where((2 * sampled.cells[:, 1:] + 2 < grid.n).all(axis=1))
     centres = _centre_keys(sampled.cells, 2, grid.n)
-    inferred = np.where(sampled.values > 0, _INFERRED | _OUTSIDE, _INFERRED).astype(np.int8)
+    inferred = _states(sampled.values, _INFERRED)
     offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     for squared in (3, 2, 1):
         sure = sampled.decides(np.sqrt(squared))
         near, signs = centres[sure], inferred[sure]
         for offset in offsets[np.square(offsets).sum(axis=1) == squared]:
-            states[near + _distance(offset, grid.n)] = signs
+            states[near + int(offset @ [grid.n**2, grid.n, 1])] = signs
     return states
-
-
-def _distance(offset: np.ndarray, n: int) -> int:
-    """Difference of the keys of two nodes that lie steps [3] along the axes apart."""
-    return int(offset @ [n * n, n, 1])
 
 
 def _node_keys(cells: np.ndarray, stride: int, steps: Sequence[int], n: int) -> np.ndarray:
@@ -156,24 +149,27 @@ def _refine(grid: Grid, parents: SampledCells, stride: int) -> SampledCells:
 
 def _evaluate(grid: Grid, keys: np.ndarray, states: np.ndarray, samples: list) -> bool:
     """Evaluates the nodes that are not yet; returns whether an inferred sign proves wrong."""
-    keys = np.sort(keys[states[keys] < _EVALUATED])
+    keys = np.sort(keys[np.abs(states[keys]) < _EVALUATED])
     keys = keys[np.diff(keys, prepend=-1) > 0]  # np.unique is 30 times slower on keys that repeat little
     values = grid.evaluate(keys)
-    before, after = states[keys], _evaluated_states(values)
+    before, after = states[keys], _states(values, _EVALUATED)
     states[keys] = after
     samples.append((keys, values))
-    return bool(((before != 0) & ((before ^ after) & _OUTSIDE > 0)).any())
+    return bool((before * after < 0).any())
 
 
-def _evaluated_states(values: np.ndarray) -> np.ndarray:
-    return np.where(values > 0, _EVALUATED | _OUTSIDE, _EVALUATED).astype(np.int8)
+def _states(values: np.ndarray, size: int) -> np.ndarray:
+    return np.where(values > 0, np.int8(size), np.int8(-size))
 
 
 def _crossed_cells(outside: np.ndarray, nodes: np.ndarray, n: int) -> np.ndarray:
     """[C, 2, 2, 2] whether the sign changes on the cells of blocks with these nodes, `outside` or not."""
-    corners = np.stack([outside[:, i : i + 2, j : j + 2, k : k + 2] for i, j, k in np.ndindex(2, 2, 2)])
+    some = every = outside  # of a cell's corners
+    for axis in (1, 2, 3):
+        low, high = (tuple([slice(None)] * axis + [slice(first, first + 2)]) for first in (0, 1))
+        some, every = some[low] | some[high], every[low] & every[high]
     is_within = nodes[:, 1:, 1:, 1:] - nodes[:, :2, :2, :2] == n * n + n + 1  # no node comes twice
-    return (corners.any(axis=0) != corners.all(axis=0)) & is_within
+    return (some != every) & is_within
 
 
 def _crossed_neighbours(active: np.ndarray, blocks: np.ndarray, outside: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ at -1 + 2 * i / (n - 1): both end points are included.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,7 @@ import torch
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh
 
-Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-"""Maps points [B, N, 3] float32, normalised frame, and shapes [B] int64 to signed distances [B, N]."""
+Fields = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]  # points [B, N, 3], shapes [B] -> [B, N]
 
 TILE = 1024  # points of a shape in a row of a call: shapes need unequal numbers of them, and share calls
 
@@ -55,7 +55,8 @@ class Grid:
         together = max(1, self.batch // TILE)
         for start in range(0, len(tiles), together):
             part = slice(start, start + together)
-            values[part] = self.values_at(self._points(tiles[part]), owner[part] + self.shapes.start)
+            ijk = torch.stack(indices(torch.from_numpy(tiles[part]).to(self.device), self.n), dim=-1)
+            values[part] = self.values_at(self.axis[ijk], owner[part] + self.shapes.start)
         return values.reshape(-1)[place]
 
     @torch.no_grad()  # not inference_mode: tensors that a field caches must stay usable in training
@@ -73,8 +74,9 @@ class Grid:
         """A mesh in grid steps as one in the normalised frame."""
         return Mesh(vertices.astype(np.float64) * (2 / (self.n - 1)) - 1, faces.astype(np.int64))
 
-    def _points(self, tiles: np.ndarray) -> torch.Tensor:
-        keys = torch.from_numpy(tiles).to(self.device)
-        column = keys // self.n
-        i = column // self.n
-        return self.axis[torch.stack([i, column - i * self.n, keys - column * self.n], dim=-1)]
+
+def indices(keys: Any, n: int) -> tuple[Any, Any, Any]:
+    """i, j and k of keys, arrays or tensors; `np.unravel_index` is several times slower."""
+    columns = keys // n
+    i = columns // n
+    return i, columns - i * n, keys - columns * n

@@ -11,16 +11,11 @@ from sdfhub.shapes import Mesh
 from sdfhub.whole_file import write_whole
 
 FORMATS = ("ply", "obj", "glb")  # formats of written meshes
-# distance from the origin, in sizes of a mesh, beyond which 32-bit coordinates lose a millionth of it, as do
-# geographic ones. GLB has no other coordinates; OBJ is text.
-FAR = 16
+FAR = 16  # sizes of a mesh from the origin, from where 32 bits lose a millionth of it: geographic coordinates
 
 
 def write_mesh(vertices: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Writes a mesh [V, 3], [F, 3] in the format of the path's suffix, one of FORMATS, whole or not at all.
-
-    Without faces nothing is written, and an earlier mesh there is removed.
-    """
+    """Writes a mesh as its path's suffix says, whole or not at all; without faces removes an earlier one."""
     if not len(faces):
         path.unlink(missing_ok=True)
     elif path.suffix == ".ply":

@@ -1,23 +1,21 @@
 """From fields to meshes: marching cubes at the zero level, dense or coarse to fine, one shape or many.
 
-Grid: `resolution` nodes along each axis of the cube [-1, 1]^3, both end points included.
-
 Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with Topological Guarantees, 2003
 (the triangles of a cell; scikit-image's implementation).
 """
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
 from skimage.measure import marching_cubes
 
 from sdfhub.geometry.coarse_to_fine import evaluate_crossed_cells, sample_blocks
-from sdfhub.geometry.grid import Fields, Grid
+from sdfhub.geometry.grid import Fields, Grid, indices
 from sdfhub.shapes import Mesh
 
-Field = Callable[[torch.Tensor], torch.Tensor]
-"""Maps points [N, 3] float32, normalised frame, to signed distances [N], negative inside."""
+Field = Callable[[torch.Tensor], torch.Tensor]  # points [N, 3] float32 -> signed distances [N]
 
 _EMPTY = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape
@@ -25,23 +23,13 @@ _CACHED, _LARGE = 2**13, 2**20  # points per call: what the cache of one core ke
 
 
 def mesh_fields(
-    fields: Fields,
-    shapes: int,
-    resolution: int = 256,
-    batch: int | None = None,
-    device: torch.device | str = "cpu",
+    fields: Fields, shapes: int, resolution: int = 256, batch: int | None = None, device: Any = "cpu"
 ) -> Iterator[Mesh]:
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
 
-    A mesh equals that of `mesh_dense` but for connected pieces of surface that lie wholly in skipped cells.
-    Where the surface leaves the cube the mesh is open. Shapes are meshed in groups, which bounds the memory.
-
-    Args:
-        fields: is asked for shapes 0 ... shapes - 1, in any order and repeated.
-        shapes: how many: a mesh each, in order; empty where the field has no zero crossing.
-        resolution: grid nodes per axis, >= 2.
-        batch: points per call of `fields`; None chooses by device.
-        device: where `fields` expects its points.
+    `fields` is asked for shapes 0 ... shapes - 1 on `device`, in any order and repeated, for `batch` points a
+    call (None chooses by device). A mesh equals that of `mesh_dense` but for connected pieces of surface that
+    lie wholly in skipped cells; it is open where the surface leaves the cube, empty where there is none.
     """
     nodes = resolution**3
     together = max(1, _NODES_TOGETHER // nodes)
@@ -65,21 +53,16 @@ def mesh_dense(field: Field, resolution: int = 256, device: torch.device | str =
     grid, nodes = _grid(_as_fields(field), range(1), resolution, None, device), resolution**3
     keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
     values = np.concatenate([grid.evaluate(part) for part in keys])
-    return grid.to_frame(*_march(values.reshape((resolution,) * 3)))
+    has_surface, volume = values.min() <= 0 < values.max(), values.reshape((resolution,) * 3)
+    return grid.to_frame(*(marching_cubes(volume, 0.0)[:2] if has_surface else _EMPTY))
 
 
 def sdf_slice(
-    field: Field,
-    axis: int = 1,
-    offset: float = 0.0,
-    resolution: int = 256,
-    device: torch.device | str = "cpu",
+    field: Field, axis: int = 1, offset: float = 0.0, resolution: int = 256, device: Any = "cpu"
 ) -> np.ndarray:
-    """The field on a plane across `axis` (0, 1 or 2), `offset` from the origin, normalised frame.
+    """The field [resolution, resolution] float32 on a plane across `axis`, `offset` from the origin.
 
-    Returns:
-        [resolution, resolution] float32, one index for each of the two axes left, in their order, both
-        ascending; the outermost nodes lie on the cube's faces.
+    Normalised frame; one index for each of the two axes left, in their order, both ascending.
     """
     grid = _grid(_as_fields(field), range(1), resolution, None, device)
     plane = torch.cartesian_prod(grid.axis, grid.axis)
@@ -89,35 +72,21 @@ def sdf_slice(
     return np.concatenate(parts).reshape(resolution, resolution)
 
 
-def _grid(
-    fields: Fields, shapes: range, resolution: int, batch: int | None, device: torch.device | str
-) -> Grid:
+def _grid(fields: Fields, shapes: range, resolution: int, batch: int | None, device: Any) -> Grid:
     device = torch.device(device)
     batch = batch or (_CACHED * torch.get_num_threads() if device.type == "cpu" else _LARGE)
     return Grid(fields, shapes, resolution, batch, device)
 
 
 def _as_fields(field: Field) -> Fields:
-    """A field of one shape as fields of a single one."""
     return lambda points, shapes: field(points.flatten(0, 1)).unflatten(0, points.shape[:2])
 
 
-def _march(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices, in grid steps, and outward faces of [n, n, n] float32; empty where nothing crosses zero."""
-    return marching_cubes(volume, 0.0)[:2] if volume.min() <= 0 < volume.max() else _EMPTY
-
-
-def _march_cells(
-    cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same of cells alone, from nodes around the surface.
-
-    Flat indices [M] of the cells' lowest nodes in a grid of n nodes per axis, x slowest, those [K] of nodes,
-    all corners of the cells among them, and float32 values [K] there.
-    """
+def _march_cells(cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int) -> tuple[Any, Any]:
+    """Vertices in grid steps and faces of cells [M], keys of lowest nodes, from values [K] at nodes [K]."""
     if not len(cells):
         return _EMPTY
-    cells, nodes = _indices(cells, n), _indices(nodes, n)
+    cells, nodes = np.stack(indices(cells, n)), np.stack(indices(nodes, n))
     low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is marched
     is_within = np.logical_and.reduce((nodes >= low[:, None]) & (nodes <= high[:, None]))
     volume, mask = np.ones(high - low + 1, np.float32), np.zeros(high - low + 1, bool)
@@ -125,10 +94,3 @@ def _march_cells(
     mask[tuple(cells - low[:, None] + 1)] = True  # a cell is marked at its upper corner
     vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=mask)
     return vertices + low.astype(np.float32), faces
-
-
-def _indices(keys: np.ndarray, n: int) -> np.ndarray:
-    """Indices [3, N] of flat keys; `np.unravel_index` is several times slower."""
-    columns = keys // n
-    i = columns // n
-    return np.stack([i, columns - i * n, keys - columns * n])

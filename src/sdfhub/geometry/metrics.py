@@ -1,15 +1,12 @@
 """How good a reconstructed mesh is: Chamfer distance, its noise floor, and what Chamfer misses.
 
 Lengths are in units of the meshes' common frame, the normalised one unless a name says `source`, Chamfer
-distances in their squares; nothing is multiplied by 10^3 here.
-
-Two samplings of one surface differ by the *noise floor*, which grows with area and falls with the number of
-points. `excess` is the rest of a Chamfer distance.
+distances in their squares; nothing is multiplied by 10^3 here. Two samplings of one surface differ by the
+*noise floor*, which grows with area and falls with the number of points.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import partial
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import igl
@@ -21,14 +18,11 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
-FAILURES = (
-    "failed: shapes without a reconstructed surface. They enter no statistic but cd_mean_with_failures and "
-    "cd_median_with_failures, where each counts as if its reconstruction were one point at the origin."
-)
-"""How `summarize` treats failures, in words for a report."""
-
-STATISTICS: dict[str, Callable[..., Any]]
-STATISTICS = {"mean": np.mean, "median": np.median, "p90": partial(np.percentile, q=90)}
+STATISTICS: dict[str, Callable[..., Any]] = {
+    "mean": np.mean,
+    "median": np.median,
+    "p90": lambda x: np.percentile(x, 90),
+}
 
 
 @dataclass(frozen=True)
@@ -57,10 +51,7 @@ class ShapeMetrics:
 def judge(
     reconstruction: Mesh, truth: NormalizedMesh, points: int = 30_000, seed: int = 0, tau: float = 0.01
 ) -> ShapeMetrics:
-    """All metrics of a reconstruction, normalised frame, against the true mesh, from `points` samples a side.
-
-    The same seed gives the same judgement; tau is the threshold of the F-score, normalised frame.
-    """
+    """All metrics of a reconstruction, normalised frame, by `points` samples a side; tau: of the F-score."""
     mesh = Mesh(*map(np.ascontiguousarray, reconstruction, (np.float64, np.int64)))
     true_mesh = Mesh(truth.vertices, truth.faces)
     expected, true_normals = sample_surface(*true_mesh, points, (seed, 0))
@@ -106,9 +97,7 @@ def chamfer(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def volumetric_iou(a: Mesh, b: Mesh, seed: int = 0, count: int = 20_000) -> float | None:
-    """Volume inside both meshes over volume inside either, from `count` points in their joint bounding box.
-
-    A point is inside where the winding number is positive. None where a mesh is open.
+    """Volume inside both meshes over that inside either, by `count` points in their box; None if one is open.
 
     Source: Barill et al., Fast Winding Numbers for Soups and Clouds, 2018.
     """
@@ -139,19 +128,33 @@ def _edges_cancel(faces: np.ndarray) -> bool:
     return np.array_equal(rising, falling)
 
 
-def summarize(rows: Sequence[ShapeMetrics]) -> dict[str, Any]:
-    """Mean, median and 90th percentile of every metric over a set of shapes, failures counted beside them.
+@dataclass(frozen=True)
+class DistanceMetrics:
+    """The judgement of a field where the source has no mesh."""
 
-    `count` is the number of shapes that have a metric; its statistics are None where there is none.
-    """
-    with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
-    summary = {"shapes": len(rows), "failed": sum(row.failed for row in rows), "failures": FAILURES}
-    for name in ("mean", "median"):
-        summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
-    for name in (field.name for field in fields(ShapeMetrics) if field.name not in ("failed", "cd_penalty")):
-        values = [getattr(row, name) for row in rows if not row.failed and getattr(row, name) is not None]
-        statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
-        summary[name] = statistics | {"count": len(values)}
+    sdf_error: float  # mean |f - d| over samples with |d| < delta, normalised units
+    sign_accuracy: float  # share of samples on the right side
+
+
+def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, Any]:
+    """Statistics of every metric over a set of shapes, and the `count` of shapes that have it."""
+    summary: dict[str, Any] = {"shapes": len(metrics)}
+    rows = [row for row in metrics if isinstance(row, ShapeMetrics)]
+    if len(rows) == len(metrics):
+        summary |= {"failed": sum(row.failed for row in rows)}
+        summary["failures"] = (
+            "one point at the origin in the statistics with_failures, left out of all others"
+        )
+        with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
+        for name in ("mean", "median"):
+            summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
+    plain = [asdict(row) for row in metrics if not getattr(row, "failed", False)]
+    kind: Any = metrics[0] if metrics else ShapeMetrics
+    for name in (field.name for field in fields(kind)):
+        if name not in ("failed", "cd_penalty"):
+            values = [row[name] for row in plain if row[name] is not None]
+            statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
+            summary[name] = statistics | {"count": len(values)}
     return summary
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -22,7 +21,7 @@ def contact_sheet(
     """
     size = next((len(image) for row in rows for image in row if not isinstance(image, str)), 256)
     columns, font_size = max(map(len, rows), default=0), max(11, size // 14)
-    font = ImageFont.load_default(font_size)
+    font, large = ImageFont.load_default(font_size), ImageFont.load_default(max(6, size // 9))
     left = int(max(map(font.getlength, row_labels), default=-14)) + 20
     tall = int(1.35 * font_size * max((caption.count("\n") + 1 for caption in captions), default=0)) + 16
     bands = [tall if i * columns < len(captions) else _GAP for i in range(len(rows))]
@@ -30,27 +29,23 @@ def contact_sheet(
     top = 0
     for i, (row, band) in enumerate(zip(rows, bands, strict=True)):
         for j, content in enumerate(row):
+            tile = Image.new("RGB", (size, band + size), "white")  # cuts long captions off
+            draw, pad = ImageDraw.Draw(tile), size // 16
             caption = "".join(captions[i * columns + j :][:1])
-            page.paste(_tile(content, caption, size, band, font), (left + j * (size + _GAP), top))
+            draw.text((4, band / 2), caption, fill=_INK, font=font, anchor="lm")
+            if isinstance(content, str):
+                draw.rectangle((pad, band + pad, size - pad, band + size - pad), fill=_TILE, outline=_FAINT)
+                draw.text((size / 2, band + size / 2), content, fill=_FAINT, font=large, anchor="mm")
+            else:
+                tile.paste(Image.fromarray(content), (0, band))
+            page.paste(tile, (left + j * (size + _GAP), top))
         if row_labels:
             place = 10, top + band + size / 2
             ImageDraw.Draw(page).text(place, row_labels[i], fill=_INK, font=font, anchor="lm")
         top += band + size
-    return _write(page, path)
-
-
-def _tile(content: np.ndarray | str, caption: str, size: int, band: int, font: Any) -> Image.Image:
-    """A picture, or a text in its place, below a band for its caption."""
-    tile = Image.new("RGB", (size, band + size), "white")
-    draw = ImageDraw.Draw(tile)
-    if isinstance(content, str):
-        pad, large = size // 16, ImageFont.load_default(max(6, size // 9))
-        draw.rectangle((pad, band + pad, size - pad, band + size - pad), fill=_TILE, outline=_FAINT)
-        draw.text((size / 2, band + size / 2), content, fill=_FAINT, font=large, anchor="mm")
-    else:
-        tile.paste(Image.fromarray(content), (0, band))
-    draw.text((4, band / 2), caption, fill=_INK, font=font, anchor="lm")
-    return tile
+    with whole_file(path) as file:
+        page.save(file, "PNG")
+    return path
 
 
 def animation(images: Sequence[np.ndarray], path: Path, seconds: float = 2.0) -> Path:
@@ -59,10 +54,6 @@ def animation(images: Sequence[np.ndarray], path: Path, seconds: float = 2.0) ->
     frames = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     frames += frames[-2:0:-1]
     duration = round(1000 * seconds / max(1, len(images) - 1))
-    return _write(frames[0], path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
-
-
-def _write(picture: Image.Image, path: Path, **settings: Any) -> Path:
     with whole_file(path) as file:
-        picture.save(file, format=path.suffix[1:], **settings)
+        frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
     return path

@@ -1,7 +1,4 @@
-"""Meshes to pictures by ray casting, without a display.
-
-Frame: +z up, shapes within the unit ball, their front towards -y; meshes with +y up are turned first.
-"""
+"""Meshes within the unit ball, +z up, front towards -y, to pictures by ray casting, without a display."""
 
 import igl
 import numpy as np
@@ -13,30 +10,19 @@ from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.triangles import face_normals
 
 _CLAY = np.array([0.30, 0.46, 0.72])  # surface colour, linear RGB
+_KEY = np.array([-0.45, -0.6, 0.95]) / np.linalg.norm([-0.45, -0.6, 0.95])  # towards the light
 _CREASE = 38.0  # degrees; edges sharper than this stay sharp
 _SMOOTH_FACES = 200_000  # above it a face is about a pixel and smoothing shows nothing
 _FAR = 5.0  # of the camera from the origin
 
 
 def render(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    size: int = 256,
-    *,
-    up: UpAxis = "z",
-    azimuth: float = -55.0,
-    elevation: float = 24.0,
-    background: float = 1.0,
+    vertices, faces, size: int = 256, *, up: UpAxis = "z", azimuth=-55.0, elevation=24.0, background=1.0
 ) -> np.ndarray:
-    """A shaded picture [size, size, 3] uint8 of a mesh from a three-quarter view, lit on both sides.
+    """A shaded picture [size, size, 3] uint8 of a mesh [V, 3], [F, 3] within the unit ball, both sides lit.
 
-    Args:
-        vertices, faces: [V, 3], within the unit ball, and [F, 3]; F = 0 gives the background.
-        size: width and height in pixels.
-        up: the axis of the mesh that points up; with "y" its front looks along +z, as is usual there.
-        azimuth: direction of the camera around z in degrees, from +x towards +y; -90 looks at the front.
-        elevation: height of the camera above the horizon in degrees.
-        background: sRGB grey level around the shape, in [0, 1].
+    The camera stands `azimuth` degrees around z, from +x towards +y, where -90 looks at the front, and
+    `elevation` degrees above the horizon. Without faces it sees the background, an sRGB grey in [0, 1].
     """
     image = np.full((2 * size * 2 * size, 3), background**2.2)
     faces = np.asarray(faces)
@@ -57,9 +43,9 @@ def render(
 
 
 def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
-    """A slice [R, R] of signed distances in colour [R, R, 3] uint8: blue inside, orange outside, zero black.
+    """A slice [R, R], x to the right, as a picture [R, R, 3] uint8: blue inside, orange outside, zero black.
 
-    Colours saturate at delta; there is a line every delta / 4. The first index runs right, the second up.
+    Colours saturate at delta; there is a line every delta / 4.
     """
     sdf = np.asarray(sdf_grid, dtype=np.float64).T[::-1]
     amount = np.clip(np.abs(sdf) / delta, 0, 1)[..., None]
@@ -72,10 +58,8 @@ def slice_image(sdf_grid: np.ndarray, delta: float) -> np.ndarray:
 
 def _changes(labels: np.ndarray) -> np.ndarray:
     """Pixels whose right or lower neighbour has another label."""
-    edge = np.zeros(labels.shape, dtype=bool)
-    edge[:, :-1] |= labels[:, :-1] != labels[:, 1:]
-    edge[:-1] |= labels[:-1] != labels[1:]
-    return edge
+    down, right = np.diff(labels, axis=0, append=labels[-1:]), np.diff(labels, append=labels[:, -1:])
+    return (down != 0) | (right != 0)
 
 
 def seen_from(
@@ -108,21 +92,15 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
     return smooth * sign, flat * sign
 
 
-def _lights() -> tuple[np.ndarray, np.ndarray]:
-    """Directions [L, 3] and colours [L, 3] of a soft key and of a sky dome, about 1 on a level plane."""
-    key = _unit(_unit(np.array([-0.45, -0.6, 0.95])) + 0.09 * sphere_directions(12))
-    dome = sphere_directions(32)
-    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
-    warm, cool = np.tile([1.0, 0.95, 0.87], (12, 1)) / 3, 0.2 * strength[:, None] * [0.88, 0.95, 1.0]
-    return np.concatenate([key, dome]), np.concatenate([warm, cool])
-
-
 def _light(scene: EmbreeScene, points: np.ndarray, normals: np.ndarray, subpixel: np.ndarray) -> np.ndarray:
-    """[N, 3] light at the points [N, 3], with shadows.
+    """[N, 3] light of a soft key and of a sky dome at points [N, 3], about 1 on a level plane, with shadows.
 
     The four samples of a pixel are lit by four interleaved sets of lights: their mean is smooth.
     """
-    directions, colours = _lights()
+    key, dome = _unit(_KEY + 0.09 * sphere_directions(12)), sphere_directions(32)
+    strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
+    warm, cool = np.tile([1.0, 0.95, 0.87], (12, 1)) / 3, 0.2 * strength[:, None] * [0.88, 0.95, 1.0]
+    directions, colours = np.concatenate([key, dome]), np.concatenate([warm, cool])
     total = np.zeros(points.shape)
     for first in range(0, len(directions), 4):
         lights = directions[first + subpixel]

@@ -8,10 +8,7 @@ from sdfhub.triangles import face_normals
 def sample_surface(
     vertices: np.ndarray, faces: np.ndarray, count: int, seed: int | tuple[int, ...] | np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Independent points [count, 3] on a mesh, and the unit normals [count, 3] of their faces, both float64.
-
-    The points of a face come together. Raises ValueError for a mesh without area.
-    """
+    """Points [count, 3] on a mesh, face by face, and normals [count, 3]; a ValueError if it has no area."""
     rng = np.random.default_rng(seed)
     normals = face_normals(vertices, faces)
     area = np.linalg.norm(normals, axis=1)

@@ -20,11 +20,7 @@ KNOWN = 5e-3  # bounds no further apart than this, normalised frame, make a sign
 
 @dataclass(frozen=True)
 class DeepSdfFit:
-    """Adam on fresh samples at every step, half of them inside.
-
-    Source: DeepSDF's published code: 800 steps, the learning rate divided by 10 halfway, z from
-    N(0, 0.01^2), prior 1e-4 * mean z^2, 8000 samples a step.
-    """
+    """Adam on fresh samples at every step, half of them inside. Source: DeepSDF's published code."""
 
     steps: PositiveInt = 800
     lr: PositiveFloat = 5e-3

@@ -10,6 +10,8 @@ from sdfhub.latent.similarity import PoseRange, Similarity
 from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Observation
 
+Shapes = Sequence[Observation]
+
 
 class Fitted(NamedTuple):
     """The shapes behind B observations."""
@@ -30,7 +32,7 @@ class Fit(Protocol):
         self,
         decoder: Decoder,
         codes: Tensor,
-        observations: Sequence[Observation],
+        observations: Shapes,
         delta: float,
         poses: PoseRange | None = None,
     ) -> Fitted:
@@ -39,12 +41,9 @@ class Fit(Protocol):
         Args:
             decoder: stays as it is; its mode is restored.
             codes: [S, L] of the training shapes.
-            observations: B of them.
-            delta: clamp of distances, normalised frame, > 0: the training's.
-            poses: where the observations' frames are unknown: how far they may be off; else None.
-
-        Raises:
-            SdfhubError: this fit cannot use such observations.
+            observations: B of them; an SdfhubError says that this fit cannot use such.
+            delta: clamp of distances in the training, normalised frame, > 0.
+            poses: how far unknown frames of observations may be off; None where they are known.
         """
 
 

@@ -1,20 +1,19 @@
 """Codes of observed shapes, and poses where these are unknown, by Gauss-Newton from several starts."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Annotated, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from sdfhub.latent.fitting import Fitted, frozen
+from sdfhub.latent.fitting import Fitted, Shapes, frozen
 from sdfhub.latent.gaussian import Gaussian
 from sdfhub.latent.problem import Problem, Rows, violation
 from sdfhub.latent.similarity import Similarity, small_similarity
 from sdfhub.model.fast.side_by_side import side_by_side
-from sdfhub.shapes import Observation
 
 ROWS_TOGETHER = 2**14  # rows of descents that are worked on together, or one shape's; bounds memory
 CODES_TOGETHER = 64  # training codes compared at a time with an observation
@@ -33,19 +32,16 @@ class Descents(NamedTuple):
 class GaussNewtonFit:
     """Damped Gauss-Newton from several starts on a few rows, and from the best of them on more, then on all.
 
-    A step solves for the code instead of following its gradient: some twenty do what Adam needs hundreds for.
     Starts: the mean of the training codes, draws from their distribution, and the training codes nearest to
-    the observation. With an unknown pose: as many turns of it, each with the training code nearest then, the
-    best ones. Signed samples have DeepSDF's prior, N(0, 1) in every direction; what scans leave open, the
-    distribution of the training codes decides.
+    the observation, or, with an unknown pose, the best of its turns with the training code nearest then.
+    Signed samples have DeepSDF's prior, N(0, 1) in every direction, scans the training codes' distribution.
     """
 
     samples: PositiveInt = 16384  # signed samples that an observation of a stored shape should hold
     lambda_code: NonNegativeFloat = 1e-4  # weight of DeepSDF's prior, mean z^2, for signed samples
     weight: NonNegativeFloat = 1e-4  # of the distribution of the training codes, for scans
     weight_partial: NonNegativeFloat = 1e-3  # the same for scans of only a part of the surface
-    shrinkage: Annotated[float, Field(ge=1e-4, le=1)] = 0.1
-    """Share of the isotropic covariance in that distribution; with less, few codes leave a singular one."""
+    shrinkage: Annotated[float, Field(ge=1e-4, le=1)] = 0.1  # share of isotropic covariance, against singular
     random: NonNegativeInt = 2  # draws from that distribution to start from
     nearest: NonNegativeInt = 3  # training codes to start from, by their violation on `probes` rows
     probes: PositiveInt = 256  # rows that training codes, and turns of an unknown pose, are compared on
@@ -67,7 +63,7 @@ class GaussNewtonFit:
         with frozen(decoder):
             problem = Problem(decoder, priors, delta, poses)
 
-            def fit(group: Sequence[Observation]) -> list[Tensor]:
+            def fit(group: Shapes) -> list[Tensor]:
                 prior = [0 if shape.is_exact else 1 + shape.partial for shape in group]
                 return self._fit(problem, codes, blind, Rows.of(group, self.smallest, prior, codes.device))
 
@@ -121,8 +117,6 @@ class GaussNewtonFit:
     def _descend(self, problem: Problem, rows: Rows, starts: Descents, every: int) -> tuple[Descents, Tensor]:
         """Where descents on every so many-th row end, and the objectives [D] there.
 
-        A step that does not lower the true objective is not taken, and the next is damped more.
-
         Source: Levenberg 1944 and Marquardt 1963.
         """
         size = max(1, ROWS_TOGETHER * every // rows.points.shape[1])
@@ -154,15 +148,8 @@ class GaussNewtonFit:
         return Descents(shape, turn, unknowns, damping), here[0]
 
 
-def in_groups(
-    fit: Callable[[Sequence[Observation]], Sequence[Tensor]],
-    observations: Sequence[Observation],
-    device: torch.device,
-) -> list[Tensor]:
-    """What a fit finds of each observation: on a CPU one by one, elsewhere all of one size at once.
-
-    On a CPU each has a thread of its own, so that no neighbour changes even a rounding.
-    """
+def in_groups(fit: Callable[[Shapes], list[Tensor]], observations: Shapes, device: Any) -> list[Tensor]:
+    """What a fit finds: on a CPU one by one, so that no neighbour changes a rounding, else by size."""
     groups: dict[int, list[int]] = {}
     for row, observation in enumerate(observations):
         groups.setdefault(row if device.type == "cpu" else len(observation.points), []).append(row)

@@ -26,10 +26,6 @@ class Gaussian:
         mean variance in all directions), gives those that they lack.
 
         Source: Ledoit and Wolf 2004, with a given share in place of their estimate.
-
-        >>> codes = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 1.0], [3.0, 1.0]])
-        >>> Gaussian.of(codes).mean
-        tensor([1.5000, 0.5000])
         """
         precise = codes.detach().double()
         mean = precise.mean(0)
@@ -59,10 +55,6 @@ class Gaussian:
         return self.mean + along @ self.axes + self.rest * besides
 
     def unusual(self, codes: Tensor) -> Tensor:
-        """[B] squared distances of codes [B, L] to the mean, 1 on average for codes drawn from it.
-
-        The covariance does not weigh directions: a scan that says little leaves a code where the prior wants
-        it, and no direction of what is left tells strangers better than its length.
-        """
+        """[B] squared distances of codes [B, L] to the mean, 1 on average for codes drawn from it."""
         variance = self.axes.square().sum() + self.rest**2 * len(self.mean)
         return (codes - self.mean).square().sum(1) / variance.clamp(min=1e-6 * len(self.mean))

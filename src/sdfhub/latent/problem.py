@@ -58,10 +58,7 @@ class Rows(NamedTuple):
 
 
 def violation(decoder: Decoder, codes: Tensor, rows: Rows, delta: float) -> Tensor:
-    """How far outside its bounds the clamped field of codes [B, L] is, signed: [B, N].
-
-    Rows are of B shapes, or of one for all codes; the decoder is in evaluation mode.
-    """
+    """How far outside its bounds the clamped field of codes [B, L] is, [B, N]; rows of B shapes or one."""
     field = decoder(rows.points.expand(len(codes), -1, -1), codes).clamp(-delta, delta)
     field = torch.where(rows.unsigned, field.abs(), field)
     return (field - rows.high.clamp(-delta, delta)).relu() - (rows.low.clamp(-delta, delta) - field).relu()
@@ -70,21 +67,12 @@ def violation(decoder: Decoder, codes: Tensor, rows: Rows, delta: float) -> Tens
 class Problem:
     """The objective as a function of unknowns [U]: codes [L] and, with a range of poses, 7 numbers more.
 
-    A pose is one of the range's turns followed by a small similarity.
-
-    Args:
-        decoder: in evaluation mode.
-        priors: distributions of codes and their weights; `Rows.prior` says which one a shape has.
-        delta: clamp of distances.
-        poses: None where frames are known.
+    A pose is one of the range's turns followed by a small similarity. Priors have weights, `Rows.prior` says
+    which one a shape has; the decoder is in evaluation mode.
     """
 
     def __init__(
-        self,
-        decoder: Decoder,
-        priors: Sequence[tuple[Gaussian, float]],
-        delta: float,
-        poses: PoseRange | None,
+        self, decoder: Decoder, priors: list[tuple[Gaussian, float]], delta: float, poses: PoseRange | None
     ):
         self.decoder, self.delta, self.has_pose = decoder, delta, poses is not None
         like = priors[0][0].mean
@@ -103,10 +91,9 @@ class Problem:
         return pad(codes, (0, SIZE)) if self.has_pose else codes
 
     def about(self, rows: Rows, turn: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The objective of B shapes, its gradient [B, U] and a positive definite Hessian [B, U, U].
+        """The objective at unknowns [B, U], its gradient [B, U] and a positive definite Hessian [B, U, U].
 
-        The absolute value of large violations enters as a reweighted square: |v| ~ v^2 / |v| with the weight
-        1 / max(|v|, soft) held during a step. `turn` [B] are rows of `turns`, unknowns are [B, U].
+        Large violations enter as reweighted squares: |v| ~ v^2 / |v|, 1 / max(|v|, soft) held for a step.
 
         Source: Holland and Welsch 1977 (reweighting).
         """
@@ -129,8 +116,7 @@ class Problem:
         return violation(self.decoder, unknowns[:, : self.size], rows, self.delta) / scale
 
     def _jacobian(self, rows: Rows, unknowns: Tensor) -> tuple[Tensor, Tensor]:
-        """Violations [B, N] and their derivatives [B, N, U], by one backward pass: each row has a copy of
-        its shape's unknowns."""
+        """Violations [B, N] and their derivatives [B, N, U]: each row has a copy of its shape's unknowns."""
         shapes, count = rows.low.shape
         size = ROWS_AT_ONCE if unknowns.is_cpu else shapes * count
         copies = unknowns.repeat_interleave(count, 0).split(size)

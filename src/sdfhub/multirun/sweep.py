@@ -1,11 +1,20 @@
-"""A multirun from its plan to its report: a Hydra callback."""
+"""A multirun from its plan to its report, and each of its cells.
 
+A cell is trained once and continued where it was interrupted; its failure is written down.
+"""
+
+import json
 import logging
+import os
 import shlex
 import sys
+import traceback
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -14,9 +23,18 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sdfhub.multirun.cells import planned_cell
-from sdfhub.multirun.names import register_resolvers
-from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan
+from sdfhub.composition import one_line, plain
+from sdfhub.errors import SdfhubError
+from sdfhub.multirun.names import choices_of, register_resolvers
+from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan, read_scores
+from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
+from sdfhub.whole_file import write_whole
+
+Train = Callable[[DictConfig, Path], dict[str, Any]]
+"""Trains what a composed config describes into a folder; returns what `metrics.json` holds."""
+
+WATCHING_GROUPS = ("callbacks", "logger", "debug", "paths", "extras")
+UNNAMED = {"conditioning", "decoder", "loss", "optim"}  # groups that name no row: they count as settings
 
 log = logging.getLogger(__name__)
 
@@ -36,17 +54,14 @@ class SweepRecord(Callback):
             return
         words = _words(config)
         asked = [word for word in words if word.startswith(("sweeps=", "hparams_search="))]
-        refused = ""
-        if len(asked) > 1 or "," in "".join(asked):  # Hydra would train the cells of none of them
-            refused = f"{' '.join(asked)}: one sweep or search a command"
         try:
-            self._cells = [] if refused else planned_cells(config)
+            if len(asked) > 1 or "," in "".join(asked):  # Hydra would train the cells of none of them
+                raise ValueError(f"{' '.join(asked)}: one sweep or search a command")
+            self._cells = planned_cells(config)
         except (HydraException, OmegaConfBaseException):
             return  # the sweeper composes the same cells, and its error is worded for the user
         except ValueError as error:
-            refused = " ".join(str(error).split())
-        if refused:
-            print(f"sdfhub: error: {refused}", file=sys.stderr)
+            print(f"sdfhub: error: {one_line(error)}", file=sys.stderr)
             sys.exit(2)  # what a callback raises, Hydra makes a warning of
         words += [word for word in _words(config, "hydra") if not word.startswith("hydra.mode=")]
         command = shlex.join(["python", "train.py", "-m", *words])
@@ -61,7 +76,7 @@ class SweepRecord(Callback):
         try:
             write_report(sweep, sweep / "report")
         except Exception as error:  # Hydra would make a warning of it, and never come to the exit status
-            log.error("no report: %s; to try again: sdfhub report %s", " ".join(str(error).split()), sweep)
+            log.error("no report: %s; to try again: sdfhub report %s", one_line(error), sweep)
         cells = self._cells or read_plan(sweep).cells
         if failed := sum((sweep / cell.folder / FAILURE).exists() for cell in cells):
             log.error("%d of %d cells failed", failed, len(cells))
@@ -84,3 +99,57 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
 def _words(config: DictConfig, part: str = "task") -> list[str]:
     """The overrides of the command line as they were typed."""
     return list(map(str, OmegaConf.to_container(config.hydra.overrides[part], resolve=False) or ()))
+
+
+def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, Any]:
+    """Trains a cell of a multirun unless it is finished; returns what `metrics.json` holds.
+
+    A cell that fails leaves `failed.json` and raises nothing: the others go on, under any launcher.
+    """
+    folder = Path(hydra.runtime.output_dir)
+    # ddp processes that SLURM or torchrun started train a cell together: the first holds the lock for all
+    follows = any(os.environ.get(rank, "0") != "0" for rank in ("SLURM_PROCID", "RANK"))
+    try:
+        with nullcontext() if follows else FileLock(folder / ".lock", timeout=0):
+            enter_cells(folder.parent, [planned_cell(config, hydra, folder.name)])
+            return go_on(train, config, folder)
+    except Timeout:
+        log.warning("%s: another process trains it", folder)
+    except Exception as error:
+        failure = {"reason": one_line(error), "traceback": "".join(traceback.format_exception(error))}
+        write_whole(folder / FAILURE, json.dumps(failure, indent=1))
+        log.error("%s: %s", folder.name, failure["reason"])
+    return {}
+
+
+def go_on(train: Train, config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Trains into a folder, from its last checkpoint on; a finished run only returns its metrics."""
+    (folder / FAILURE).unlink(missing_ok=True)
+    if (metrics := finished(folder, plain(config))) is not None:
+        log.info("%s: finished before", folder)
+        return metrics
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    if config.ckpt_path is None and checkpoint.is_file():
+        log.info("%s: continues from %s", folder, checkpoint.name)
+        OmegaConf.update(config, "ckpt_path", str(checkpoint))
+    return train(config, folder)
+
+
+def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
+    """The metrics of a run that was trained and judged under these settings; None where it was not."""
+    with suppress(OSError, SdfhubError):
+        trained = read_scores(folder).config  # raises where a report could not read the scores
+        if settings_digest(trained) == settings_digest(config):
+            return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return None
+
+
+def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
+    """A composed cell as `sweep.json` keeps it; a ValueError for a seed that is no whole number."""
+    choices = choices_of(config, hydra)
+    words: Any = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} as written
+    pairs = [word.lstrip("+~").partition("=") for word in words]
+    other = ("seed", *WHERE_NOT_WHAT)
+    settings = {k: v for k, _, v in pairs if not k.startswith(other) and k not in choices.keys() - UNNAMED}
+    choices = {group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS}
+    return PlannedCell(folder=folder, choices=choices, settings=settings, seed=config.seed)

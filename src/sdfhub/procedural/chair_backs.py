@@ -42,16 +42,21 @@ def _inner_sides(chair) -> np.ndarray:
     return np.linspace(-1, 1, chair.slats + 2)[1:-1]
 
 
-def _upright(chair, side: float, top: float, section: np.ndarray) -> Manifold:
-    heights = np.linspace(-0.5 * chair.seat_thickness, top, 7)
-    path = np.array([point(chair, side, h) for h in heights])
-    return parts.sweep(path, section, up=(0, 1, 0))
+def _upright(chair, side: float, heights: np.ndarray, section: np.ndarray) -> Manifold:
+    """A bar along the back's surface through some heights."""
+    return parts.sweep([point(chair, side, h) for h in heights], section, up=(0, 1, 0))
+
+
+def _rods(chair, tops) -> list[Manifold]:
+    """Thin round bars from the seat to heights, one a place between the posts."""
+    section, low = chair.spindle_width / 2 * parts.circle(10), -0.5 * chair.seat_thickness
+    rods = zip(_inner_sides(chair), tops, strict=True)
+    return [_upright(chair, side, np.linspace(low, top, 7), section) for side, top in rods]
 
 
 def _rail(chair, height: float, tall: float, thick: float, crest: float = 0.0) -> Manifold:
     """A curved rail from post to post; `crest` raises its middle."""
-    sides = np.linspace(-1, 1, 13)
-    path = np.array([point(chair, s, height + crest * (1 - s * s)) for s in sides])
+    path = [point(chair, s, height + crest * (1 - s * s)) for s in np.linspace(-1, 1, 13)]
     return parts.sweep(path, parts.rounded_rectangle(thick, tall, 0.3 * thick))
 
 
@@ -59,7 +64,8 @@ def _posts(chair) -> list[Manifold]:
     w = max(0.8 * chair.leg_width, 0.026)
     square = chair.legs in ("square", "sled")
     section = parts.rounded_rectangle(w, w, 0.12 * w) if square else 0.5 * w * parts.circle(14)
-    return [_upright(chair, side, chair.back_height, section) for side in (-1, 1)]
+    heights = np.linspace(-0.5 * chair.seat_thickness, chair.back_height, 7)
+    return [_upright(chair, side, heights, section) for side in (-1, 1)]
 
 
 def _slats(chair) -> list[Manifold]:
@@ -67,18 +73,15 @@ def _slats(chair) -> list[Manifold]:
     low, high = 0.16 * chair.back_height, chair.back_height - 0.03
     made = [*_posts(chair), _rail(chair, low, 0.035, _RAIL), _rail(chair, high, 0.06, _RAIL + 0.006)]
     width = min(0.05, 0.9 * chair.seat_width / (chair.slats + 1) * 0.6)
-    for side in _inner_sides(chair):
-        path = np.array([point(chair, side, h) for h in np.linspace(low, high, 5)])
-        made.append(parts.sweep(path, parts.rounded_rectangle(width, 0.014, 0.004), up=(0, 1, 0)))
-    return made
+    board, heights = parts.rounded_rectangle(width, 0.014, 0.004), np.linspace(low, high, 5)
+    return made + [_upright(chair, side, heights, board) for side in _inner_sides(chair)]
 
 
 def _spindles(chair) -> list[Manifold]:
     """Turned rods from the seat into a crest rail."""
     high = chair.back_height - 0.02
     made = [*_posts(chair), _rail(chair, high, 0.075, _RAIL + 0.004, crest=0.025)]
-    rod = chair.spindle_width / 2 * parts.circle(10)
-    return made + [_upright(chair, side, high, rod) for side in _inner_sides(chair)]
+    return made + _rods(chair, [high] * chair.slats)
 
 
 def _ladder(chair) -> list[Manifold]:
@@ -97,7 +100,7 @@ def _shell(chair, low: float, thick: float, round_top: float) -> Manifold:
         front = [point(chair, side, h) - [0, thick / 2, 0] for h in np.linspace(low, top, 6)]
         rear = [point(chair, side, h) + [0, thick / 2, 0] for h in np.linspace(top, low, 6)]
         sections.append(front + rear)
-    return parts.loft(np.array(sections))
+    return parts.loft(sections)
 
 
 def _solid(chair) -> list[Manifold]:
@@ -112,16 +115,12 @@ def _panel(chair) -> list[Manifold]:
 
 def _hoop(chair) -> list[Manifold]:
     """A bent bow with rods inside it."""
-    angle = np.linspace(0, np.pi, 29)
-    power = 2 / 2.6
+    angle, power = np.linspace(0, np.pi, 29), 2 / 2.6
     sides = np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power
     heights = chair.back_height * np.sin(angle) ** power
     path = [point(chair, s, h) for s, h in zip(sides, heights, strict=True)]
     root = np.array([0, 0, -0.5 * chair.seat_thickness])
     bow = np.array([path[0] + root, *path, path[-1] + root])
     made = [parts.tube(bow, max(0.42 * chair.leg_width, 0.0125), 12, up=(0, 1, 0))]
-    rod = chair.spindle_width / 2 * parts.circle(10)
-    for side in _inner_sides(chair):
-        top = chair.back_height * (1 - abs(side) ** 2.6) ** (1 / 2.6)
-        made.append(_upright(chair, side, top, rod))
-    return made
+    tops = [chair.back_height * (1 - abs(side) ** 2.6) ** (1 / 2.6) for side in _inner_sides(chair)]
+    return made + _rods(chair, tops)

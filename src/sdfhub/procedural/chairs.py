@@ -1,53 +1,45 @@
 """Chairs: dining, Windsor, ladder-back, bentwood, cantilever, swivel, tulip, from one set of parameters."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 from manifold3d import Manifold
 
 from sdfhub.procedural import chair_backs, parts
-from sdfhub.procedural.parameters import choice, continuous
 
 
-@dataclass(frozen=True)
-class Chair:
+class Chair(SimpleNamespace):
     """One chair. Lengths in metres; seat, back and legs combine freely."""
 
-    seat_height: float = continuous(0.40, 0.50)
-    seat_width: float = continuous(0.40, 0.56)
-    seat_depth: float = continuous(0.38, 0.50)
-    seat_thickness: float = continuous(0.025, 0.075)
-    seat_taper: float = continuous(0.74, 0.98)
-    back_height: float = continuous(0.34, 0.62)
-    back_lean: float = continuous(0.03, 0.14)
-    back_curve: float = continuous(0.0, 0.07)
-    back_thickness: float = continuous(0.018, 0.05)
-    leg_width: float = continuous(0.028, 0.046)
-    leg_taper: float = continuous(0.5, 0.95)
-    leg_splay: float = continuous(0.0, 0.075)
-    stretcher_height: float = continuous(0.22, 0.5)
-    arm_height: float = continuous(0.17, 0.25)
-    spindle_width: float = continuous(0.017, 0.025)
-    seat: str = choice("square", "tapered", "round")
-    back: str = choice("slats", "spindles", "ladder", "solid", "hoop", "panel")
-    legs: str = choice("square", "square", "turned", "round", "round", "sled", "cantilever", "star", "tulip")
-    arms: str = choice("none", "none", "none", "straight", "curved")
-    stretchers: str = choice("none", "none", "sides", "h", "box")
-    apron: bool = choice(True, False)
-    slats: int = choice(3, 4, 5, 6, 7)
+    parameters: ClassVar = dict(
+        seat_height=(0.4, 0.5), seat_width=(0.4, 0.56), seat_depth=(0.38, 0.5),
+        seat_thickness=(0.025, 0.075), seat_taper=(0.74, 0.98), back_height=(0.34, 0.62),
+        back_lean=(0.03, 0.14), back_curve=(0.0, 0.07), back_thickness=(0.018, 0.05),
+        leg_width=(0.028, 0.046), leg_taper=(0.5, 0.95), leg_splay=(0.0, 0.075),
+        stretcher_height=(0.22, 0.5), arm_height=(0.17, 0.25), spindle_width=(0.017, 0.025),
+        seat=["square", "tapered", "round"], back=["slats", "spindles", "ladder", "solid", "hoop", "panel"],
+        legs=["square", "square", "turned", "round", "round", "sled", "cantilever", "star", "tulip"],
+        arms=["none", "none", "none", "straight", "curved"],
+        stretchers=["none", "none", "sides", "h", "box"], apron=[True, False], slats=[3, 4, 5, 6, 7],
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The chair as one solid, standing on z = 0."""
-        return parts.union([self._seat(), *self._base(), *chair_backs.back(self), *self._arms()])
+        top, thick = self.seat_height, self.seat_thickness
+        bases = dict(sled=self._sled, cantilever=self._cantilever, star=self._star, tulip=self._tulip)
+        base = bases.get(self.legs, self._four_legs)
+        made = [parts.pad(self._outline(), top - thick, top, 0.4 * thick), *base()]
+        return parts.union([*made, *chair_backs.back(self), *self._arms()])
 
-    def outline(self) -> np.ndarray:
+    def _outline(self) -> np.ndarray:
         """[N, 2] of the seat, its front at -y."""
+        width, depth = self.seat_width, self.seat_depth
         if self.seat == "round":
-            return parts.circle(40) * np.array([self.seat_width, self.seat_depth]) / 2
+            return parts.circle(40) * np.array([width, depth]) / 2
         if self.seat == "tapered":
-            back = self.seat_width * self.seat_taper
-            return parts.rounded_rectangle(self.seat_width, self.seat_depth, 0.05, back)
-        return parts.rounded_rectangle(self.seat_width, self.seat_depth, 0.02)
+            return parts.rounded_rectangle(width, depth, 0.05, width * self.seat_taper)
+        return parts.rounded_rectangle(width, depth, 0.02)
 
     def half_width(self, y: float) -> float:
         """Half the seat's width at depth y."""
@@ -57,16 +49,8 @@ class Chair:
         taper = self.seat_taper if self.seat == "tapered" else 1.0
         return self.seat_width / 2 * (1 - along * (1 - taper))
 
-    def _seat(self) -> Manifold:
-        top, bottom = self.seat_height, self.seat_height - self.seat_thickness
-        return parts.pad(self.outline(), bottom, top, 0.4 * self.seat_thickness)
-
-    def _base(self) -> list[Manifold]:
-        bases = dict(sled=self._sled, cantilever=self._cantilever, star=self._star, tulip=self._tulip)
-        return bases.get(self.legs, self._four_legs)()
-
-    def _leg_ends(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(top, foot) of the four legs: front left, front right, back left, back right."""
+    def _four_legs(self) -> list[Manifold]:
+        """Legs in the corners, front left first, and the boards and bars between them."""
         z, inset = self.seat_height - 0.4 * self.seat_thickness, 0.7 * self.leg_width
         reach = 0.32 if self.seat == "round" else 0.5
         ends = []
@@ -75,15 +59,15 @@ class Chair:
                 x = side * (self.half_width(y) - inset * 1.1)
                 foot = (x + side * self.leg_splay * 0.7, y + np.sign(y) * self.leg_splay, 0.0)
                 ends.append((np.array([x, y, z]), np.array(foot)))
-        return ends
-
-    def _four_legs(self) -> list[Manifold]:
-        ends = self._leg_ends()
         made = [self._leg(top, foot) for top, foot in ends]
         if self.apron and self.legs != "round":
             z = self.seat_height - self.seat_thickness - 0.045 / 2 + 0.008
             made += parts.aprons([top for top, _ in ends], z, 0.018, 0.045 + 0.016)
-        return made + self._stretchers(ends)
+        if self.stretchers == "none":
+            return made
+        joints = [foot + self.stretcher_height * (top - foot) for top, foot in ends]
+        radii = None if self.legs == "square" else (0.009, 0.013)
+        return made + parts.stretchers(joints, self.stretchers, (0.018, 0.026), radii)
 
     def _leg(self, top: np.ndarray, foot: np.ndarray) -> Manifold:
         w = self.leg_width
@@ -91,19 +75,9 @@ class Chair:
             return parts.square_bar(foot, top, w * self.leg_taper, w)
         if self.legs == "round":
             return parts.bar(foot, top, 0.5 * w * self.leg_taper, 0.55 * w)
-        r, t = 0.56 * w, self.leg_taper
-        profile = [(0.6, 0), (0.75, 0.03), (0.6, 0.07), (0.5, 0.1), (0.62 + 0.2 * t, 0.3), (0.95, 0.5)]
-        profile += [(0.95, 0.56), (0.55, 0.6), (0.9, 0.63), (0.9, 0.65), (0.55, 0.68), (0.95, 0.72)]
-        return parts.turned(foot, top, parts.scaled([*profile, (1.0, 0.76), (1.0, 1.0)], r))
-
-    def _stretchers(self, ends: list[tuple[np.ndarray, np.ndarray]]) -> list[Manifold]:
-        if self.stretchers == "none":
-            return []
-        joints = [foot + self.stretcher_height * (top - foot) for top, foot in ends]
-        pairs = parts.stretchers(joints, self.stretchers)
-        if self.legs == "square":
-            return [parts.plank(a, b, 0.018, 0.026) for a, b in pairs]
-        return [parts.turned(a, b, [(0.009, 0), (0.013, 0.5), (0.009, 1)]) for a, b in pairs]
+        profile = [(0.6, 0), (0.75, 0.03), (0.6, 0.07), (0.5, 0.1), (0.62 + 0.2 * self.leg_taper, 0.3)]
+        profile += [(0.95, 0.5), (0.95, 0.56), (0.55, 0.6), (0.9, 0.63), (0.9, 0.65), (0.55, 0.68)]
+        return parts.turned(foot, top, parts.scaled([*profile, (0.95, 0.72), (1, 0.76), (1, 1)], 0.56 * w))
 
     def _sled(self) -> list[Manifold]:
         """Two closed loops of tube, one a side, joined by bars under the seat."""
@@ -123,19 +97,20 @@ class Chair:
         """A bent tube: along the floor, up at the front, back below the seat."""
         r, z = 0.36 * self.leg_width, self.seat_height - 0.75 * self.seat_thickness
         front, back = -self.seat_depth / 2 - self.leg_splay / 2, self.seat_depth * 0.5
-        x = min(self.half_width(0.25 * self.seat_depth), self.half_width(-0.25 * self.seat_depth)) - 1.2 * r
-        corners = [(x, back, r), (x, front, r), (x, front, z), (x, 0.25 * self.seat_depth, z)]
-        side = parts.tube(parts.filleted(corners, 0.09, 6), r, up=(1, 0, 0))
-        cross = parts.bar((-x, back - r, r), (x, back - r, r), r)
-        support = parts.bar((-x, 0.1 * self.seat_depth, z), (x, 0.1 * self.seat_depth, z), r)
-        return [*parts.mirrored(side), cross, support]
+        depth = self.seat_depth
+        x = min(self.half_width(0.25 * depth), self.half_width(-0.25 * depth)) - 1.2 * r
+        corners = [(x, back, r), (x, front, r), (x, front, z), (x, 0.25 * depth, z)]
+        made = parts.mirrored(parts.tube(parts.filleted(corners, 0.09, 6), r, up=(1, 0, 0)))
+        places = (back - r, r), (0.1 * depth, z)
+        return made + [parts.bar((-x, y, height), (x, y, height), r) for y, height in places]
 
     def _star(self) -> list[Manifold]:
         """A gas lift on five castors."""
         z, reach = self.seat_height - 0.5 * self.seat_thickness, 0.26 + 0.6 * self.leg_splay
-        made = [parts.lathe([(0.026, 0.075), (0.026, 0.62 * z), (0.017, 0.62 * z + 0.01), (0.017, z)])]
-        made.append(parts.lathe([(0.038, 0.07), (0.042, 0.1), (0.026, 0.14)]))
-        made.append(parts.lathe([(0.03, z - 0.06), (0.11, z - 0.02), (0.11, z)]))
+        column = [(0.026, 0.075), (0.026, 0.62 * z), (0.017, 0.62 * z + 0.01), (0.017, z)]
+        hub = [(0.038, 0.07), (0.042, 0.1), (0.026, 0.14)]
+        plate = [(0.03, z - 0.06), (0.11, z - 0.02), (0.11, z)]
+        made = [parts.lathe(profile) for profile in (column, hub, plate)]
         for out in parts.spokes(5):
             tip = reach * out + np.array([0, 0, 0.062])
             made.append(parts.bar((0, 0, 0.1), tip, 0.62 * self.leg_width, 0.42 * self.leg_width))
@@ -146,8 +121,7 @@ class Chair:
     def _tulip(self) -> list[Manifold]:
         """A disc that flares into one stem and opens below the seat."""
         z, foot = self.seat_height - 0.5 * self.seat_thickness, 0.2 + self.leg_splay
-        stem = 0.7 * self.leg_width
-        t = np.linspace(0, 1, 14)
+        stem, t = 0.7 * self.leg_width, np.linspace(0, 1, 14)
         radius = stem + (foot - stem) * (1 - t) ** 5 + (0.42 * foot - stem) * t**7
         height = 0.018 + (z - 0.018) * t
         return [parts.lathe([(foot, 0.0), *zip(radius, height, strict=True)], 32)]

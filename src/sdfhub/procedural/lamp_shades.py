@@ -9,20 +9,13 @@ from sdfhub.procedural.parts import rod
 _THIRDS = parts.spokes(3, 0.5)
 
 
-def height(lamp) -> float:
-    """Height of the lamp's shade in metres."""
-    share = {"dome": 0.72, "globe": 1.3, "bowl": 0.5, "drum": 0.9}.get(lamp.shade, 1.0)
-    return min(share * lamp.shade_height, 0.96 if lamp.shade == "globe" else 2.0) * lamp.shade_diameter()
-
-
 def head(lamp, hung: bool) -> Manifold:
     """The shade with its bulb and fitting; the axis is z, the lower rim of the shade lies at z = 0.
 
     A hung one is held from above by a rod that ends above it, another from below by one that ends under it.
     """
-    tall, gauge = height(lamp), lamp.gauge()
     build = {"dome": _dome, "globe": _globe, "bowl": _bowl}.get(lamp.shade, _open)
-    return parts.union(build(lamp, tall, gauge, hung))
+    return parts.union(build(lamp, lamp.shade_tall, lamp.gauge, hung))
 
 
 def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold]:
@@ -33,9 +26,9 @@ def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold
     return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), rod(low, high, socket)]
 
 
-def _radius(lamp, share: np.ndarray) -> np.ndarray:
+def _radius(lamp, share):
     """Radius of an open shade at a share of its height."""
-    wide = lamp.shade_diameter() / 2
+    wide = lamp.diameter / 2
     if lamp.shade == "drum":
         return wide * (1 - 0.25 * (1 - lamp.shade_taper) * share)
     if lamp.shade == "bell":
@@ -49,33 +42,27 @@ def _pleated(lamp, tall: float) -> Manifold:
     ring = parts.circle(2 * lamp.pleats) * fold
 
     def solid(offset: float, overshoot: float) -> Manifold:
-        rings = []
-        for share in np.array([-overshoot, 1 + overshoot]):
-            radius = _radius(lamp, share) + offset
-            rings.append(np.column_stack([radius * ring, np.full(len(ring), share * tall)]))
-        return parts.loft(np.array(rings))
+        shares = -overshoot, 1 + overshoot
+        return parts.loft([parts.level((_radius(lamp, s) + offset) * ring, s * tall) for s in shares])
 
-    wall = lamp.wall_thickness()
-    return solid(0.6 * wall, 0.0) - solid(-0.6 * wall, 0.05)
+    return solid(0.6 * lamp.shade_wall, 0.0) - solid(-0.6 * lamp.shade_wall, 0.05)
 
 
 def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     """A shade open at both ends, on a spider of three wires."""
-    wall = lamp.wall_thickness()
     if lamp.shade == "pleated":
         shell = _pleated(lamp, tall)
     else:
         share = np.linspace(0, 1, 12 if lamp.shade == "bell" else 2)
-        shell = parts.revolve_shell(np.column_stack([_radius(lamp, share), tall * share]), wall, 40)
-    size = 0.2 * lamp.shade_diameter() * lamp.shade_taper
-    at = 0.9
+        profile = np.column_stack([_radius(lamp, share), tall * share])
+        shell = parts.revolve_shell(profile, lamp.shade_wall, 40)
+    size, at = 0.2 * lamp.diameter * lamp.shade_taper, 0.9
     made = [shell, *_spider(lamp, tall, at, gauge)]
     if hung:
         return [*made, *_bulb(0.45 * tall, size, gauge, False), rod(0.5 * tall, tall + 2 * gauge, gauge)]
     made += _bulb(0.42 * tall, size, gauge, True)
     if lamp.fitting == "harp":
-        made += _harp(tall, at, gauge, 1.45 * size)
-        made.append(rod(-2 * gauge, 0.42 * tall, gauge))
+        made += [*_harp(tall, at, gauge, 1.45 * size), rod(-2 * gauge, 0.42 * tall, gauge)]
     else:
         made.append(rod(-2 * gauge, at * tall, gauge))
     if lamp.fitting == "rings":
@@ -89,7 +76,7 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
 
 
 def _spider(lamp, tall: float, share: float, gauge: float) -> list[Manifold]:
-    reach, z = float(_radius(lamp, np.array(share))), share * tall
+    reach, z = _radius(lamp, share), share * tall
     reach *= 1 - (0.9 / lamp.pleats if lamp.shade == "pleated" else 0.0)
     wires = [parts.bar((0, 0, z), reach * out + [0, 0, z], 0.8 * gauge) for out in _THIRDS]
     return [*wires, rod(z - 1.3 * gauge, z + 1.3 * gauge, 2 * gauge)]
@@ -105,55 +92,41 @@ def _harp(tall: float, share: float, gauge: float, wide: float) -> list[Manifold
 
 def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     """A dome closed by a cap, where the rod holds it."""
-    wide, cap = lamp.shade_diameter() / 2, 2.4 * gauge
-    angle = np.linspace(0, 0.5 * np.pi, 13)
-    power = 0.7 + 0.6 * lamp.shade_taper
-    radius = 0.7 * cap + (wide - 0.7 * cap) * np.cos(angle) ** power
+    wide, cap, angle = lamp.diameter / 2, 2.4 * gauge, np.linspace(0, 0.5 * np.pi, 13)
+    radius = 0.7 * cap + (wide - 0.7 * cap) * np.cos(angle) ** (0.7 + 0.6 * lamp.shade_taper)
     profile = np.column_stack([radius, tall * np.sin(angle)])
     size = min(0.36 * wide, 0.3 * tall)
     crown = [(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)]
-    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40), parts.lathe(crown)]
+    made = [parts.revolve_shell(profile, lamp.shade_wall, 40), parts.lathe(crown)]
     if hung:
-        made += [*_bulb(0.42 * tall, size, gauge, False), rod(0.42 * tall, tall + 4 * gauge, gauge)]
-    else:
-        made += [*_bulb(0.4 * tall, size, gauge, True), rod(-2 * gauge, tall, gauge)]
-    return made
+        return [*made, *_bulb(0.42 * tall, size, gauge, False), rod(0.42 * tall, tall + 4 * gauge, gauge)]
+    return [*made, *_bulb(0.4 * tall, size, gauge, True), rod(-2 * gauge, tall, gauge)]
 
 
 def _globe(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     """A ball of glass, open opposite to the collar that holds it."""
-    wide, cap = lamp.shade_diameter() / 2, 3.2 * gauge
+    wide, cap = lamp.diameter / 2, 3.2 * gauge
     first, last = np.arcsin(0.7 * cap / wide), np.pi - np.arcsin(0.3 + 0.45 * lamp.shade_taper)
     angle = np.linspace(first, last, 19)
     profile = np.column_stack([wide * np.sin(angle), tall / 2 * (1 - np.cos(angle))])
-    lift = 0.6 * gauge
-    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 36)]
+    made = [parts.revolve_shell(profile, lamp.shade_wall, 36)]
     made.append(parts.lathe([(0.9 * gauge, -3 * gauge), (cap, -1.5 * gauge), (1.2 * cap, 2.4 * gauge)]))
     made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, True), rod(-3.5 * gauge, 0.4 * tall, gauge)]
-    ball = parts.union(made).translate((0, 0, lift))
+    ball = parts.union(made).translate((0, 0, 0.6 * gauge))
     return [ball.rotate((180, 0, 0)).translate((0, 0, tall))] if hung else [ball]
 
 
 def _bowl(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     """A bowl that throws its light up; hung, it is carried by three rods."""
-    wide, cap = lamp.shade_diameter() / 2, 2.6 * gauge
-    share = np.linspace(0, 1, 12)
+    wide, cap, share = lamp.diameter / 2, 2.6 * gauge, np.linspace(0, 1, 12)
     radius = 0.7 * cap + (wide - 0.7 * cap) * share
     profile = np.column_stack([radius, tall * share ** (1.3 + 1.5 * lamp.shade_taper)])
     size = min(0.3 * wide, 0.3 * tall)
-    made = [parts.revolve_shell(profile, lamp.wall_thickness(), 40)]
+    made = [parts.revolve_shell(profile, lamp.shade_wall, 40)]
     made.append(parts.lathe([(gauge, -3 * gauge), (1.2 * cap, -gauge), (1.3 * cap, 2 * gauge)]))
-    made.append(rod(0, 0.5 * tall, gauge))
-    made += _bulb(0.5 * tall, size, gauge, True)
+    made += [rod(0, 0.5 * tall, gauge), *_bulb(0.5 * tall, size, gauge, True)]
     if not hung:
         return [*made, rod(-4 * gauge, 0, gauge)]
     apex = tall + 1.1 * wide
-    for out in _THIRDS:
-        made.append(parts.bar(0.97 * wide * out + [0, 0, 0.97 * tall], (0, 0, apex), 0.8 * gauge))
+    made += [parts.bar(0.97 * wide * out + [0, 0, 0.97 * tall], (0, 0, apex), 0.8 * gauge) for out in _THIRDS]
     return [*made, parts.ellipsoid((2 * gauge,) * 3, (0, 0, apex), 16), rod(apex, apex + 3 * gauge, gauge)]
-
-
-def top(lamp) -> float:
-    """Height at which a hung head ends, above its shade's lower rim."""
-    extra = 0.55 * lamp.shade_diameter() if lamp.shade == "bowl" else 0.0
-    return height(lamp) + extra + 2 * lamp.gauge()

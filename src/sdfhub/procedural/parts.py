@@ -26,7 +26,7 @@ def rod(bottom: float, top: float, radius: float, segments: int = 14) -> Manifol
 
 def box(size: Point, centre: Point) -> Manifold:
     """An axis-aligned box with sharp edges."""
-    return Manifold.cube(tuple(map(float, size)), True).translate(tuple(map(float, centre)))
+    return Manifold.cube(np.asarray(size), True).translate(np.asarray(centre))
 
 
 def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Manifold:
@@ -44,25 +44,20 @@ def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: in
     """A convex outline [N, 2] extruded with rounded rims; their radius is below half the outline's width."""
     r = min(radius, 0.49 * (top - bottom))
     if r <= 0:
-        return prism(outline, bottom, top)
+        return Manifold.extrude(CrossSection([outline]), top - bottom).translate((0, 0, bottom))
     centre = outline.mean(0)
     reach = np.linalg.norm(outline - centre, axis=1, keepdims=True)
     layers = []
     for angle in np.linspace(0, np.pi / 2, steps + 1):
         inset = centre + (outline - centre) * (1 - r * (1 - np.cos(angle)) / reach)
         for z in (top - r + r * np.sin(angle), bottom + r - r * np.sin(angle)):
-            layers.append(np.column_stack([inset, np.full(len(inset), z)]))
+            layers.append(level(inset, z))
     return Manifold.hull_points(np.vstack(layers))
 
 
-def prism(outline: np.ndarray, bottom: float, top: float) -> Manifold:
-    """A polygon (convex or not, counter-clockwise) extruded from bottom to top."""
-    section = CrossSection([np.asarray(outline, float)])
-    return Manifold.extrude(section, top - bottom).translate((0.0, 0.0, float(bottom)))
-
-
-def loft(sections: np.ndarray) -> Manifold:
+def loft(rings: Sequence | np.ndarray) -> Manifold:
     """The solid with flat ends through star-shaped sections [K, N, 3], all with one sense of rotation."""
+    sections = np.asarray(rings, float)
     vertices = np.vstack([sections.reshape(-1, 3), sections[0].mean(0), sections[-1].mean(0)])
     faces = _loft_faces(*sections.shape[:2])
     a, b, c = np.moveaxis((vertices - vertices.mean(0))[faces], 1, 0)
@@ -84,7 +79,7 @@ def _loft_faces(k: int, n: int) -> np.ndarray:
     return np.ascontiguousarray(np.vstack([*sides, low, high]).astype(np.uint64))
 
 
-def sweep(path: np.ndarray, section: np.ndarray, up: Point = (0, 0, 1)) -> Manifold:
+def sweep(path: Sequence | np.ndarray, section: np.ndarray, up: Point = (0, 0, 1)) -> Manifold:
     """A star-shaped section [N, 2] carried along a path [K, 3]: its first axis is tangent x up, its second
     along `up`, which is not parallel to the path; the path's bends must be wider than the section."""
     path = np.asarray(path, float)
@@ -102,15 +97,14 @@ def tube(path: np.ndarray, radius: float, segments: int = 12, up: Point = (0, 0,
 
 def bar(start: Point, end: Point, radius: float, end_radius: float | None = None) -> Manifold:
     """A straight round bar, tapered from radius to end_radius."""
-    profile = [(radius, 0.0), (radius if end_radius is None else end_radius, 1.0)]
-    return _along(lathe(profile, 14, stretch=False), start, end)
+    return turned(start, end, [(radius, 0.0), (end_radius or radius, 1.0)], 14)
 
 
 def square_bar(start: Point, end: Point, width: float, end_width: float | None = None) -> Manifold:
     """A straight bar of square section with its sides along x and y, cut level at both ends."""
     ends = (start, width), (end, width if end_width is None else end_width)
     square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
-    return loft(np.array([np.column_stack([w * square, np.zeros(4)]) + p for p, w in ends]))
+    return loft([level(w * square, 0) + p for p, w in ends])
 
 
 def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold:
@@ -119,9 +113,15 @@ def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold
     return sweep(np.array([start, end], float), square * (np.array([thickness, height]) / 2))
 
 
-def turned(start: Point, end: Point, profile: Profile) -> Manifold:
+def turned(start: Point, end: Point, profile: Profile, segments: int = 18) -> Manifold:
     """A lathe-turned bar: `profile` holds (radius, height), height from 0 at start to 1 at end."""
-    return _along(lathe(profile, 18, stretch=False), start, end)
+    start = np.asarray(start, float)
+    axis = np.asarray(end, float) - start
+    direction = _unit(axis)
+    helper = np.array([1.0, 0, 0]) if abs(direction[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = _unit(np.cross(helper, direction))
+    placed = np.column_stack([x, np.cross(direction, x), axis, start])
+    return lathe(profile, segments, stretch=False).transform(placed)
 
 
 def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifold:
@@ -131,8 +131,7 @@ def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifol
     """
     turn = 2 * np.pi / segments
     ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
-    rings = [np.column_stack([r * ring, np.full(segments, z)]) for r, z in np.asarray(profile, float)]
-    return loft(np.array(rings))
+    return loft([level(r * ring, z) for r, z in np.asarray(profile, float)])
 
 
 def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:
@@ -146,7 +145,7 @@ def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> 
 
 def ellipsoid(radii: Point, centre: Point, segments: int = 24) -> Manifold:
     """An ellipsoid with its axes along x, y and z."""
-    return Manifold.sphere(1.0, segments).scale(tuple(map(float, radii))).translate(tuple(map(float, centre)))
+    return Manifold.sphere(1.0, segments).scale(np.asarray(radii)).translate(np.asarray(centre))
 
 
 def circle(segments: int) -> np.ndarray:
@@ -203,13 +202,24 @@ def aprons(tops: Sequence[np.ndarray], height: float, thickness: float, tall: fl
     return [plank(level[a], level[b], thickness, tall) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))]
 
 
-def stretchers(joints: Sequence[np.ndarray], style: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Ends of the bars between four legs: along the sides, and for "h" and "box" also across."""
+def stretchers(joints: Sequence[np.ndarray], style: str, board: Point, radii: Point | None) -> list[Manifold]:
+    """Bars between four legs: along the sides, and for "h" and "box" also across; turned with `radii` at
+    their ends and in their middle, or `board`s of a thickness and a height."""
     left, right, rear_left, rear_right = joints
-    sides = [(left, rear_left), (right, rear_right)]
+    pairs = [(left, rear_left), (right, rear_right)]
     if style == "h":
-        return [*sides, ((left + rear_left) / 2, (right + rear_right) / 2)]
-    return [*sides, (left, right), (rear_left, rear_right)] if style == "box" else sides
+        pairs.append(((left + rear_left) / 2, (right + rear_right) / 2))
+    if style == "box":
+        pairs += [(left, right), (rear_left, rear_right)]
+    if radii is None:
+        return [plank(a, b, *board) for a, b in pairs]
+    profile = [(radii[0], 0), (radii[1], 0.5), (radii[0], 1)]
+    return [turned(a, b, profile) for a, b in pairs]
+
+
+def level(outline: np.ndarray, z: float) -> np.ndarray:
+    """Points [N, 3] of an outline [N, 2] at height z."""
+    return np.column_stack([outline, np.full(len(outline), z)])
 
 
 def mirrored(part: Manifold) -> list[Manifold]:
@@ -219,13 +229,3 @@ def mirrored(part: Manifold) -> list[Manifold]:
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _along(unit: Manifold, start: Point, end: Point) -> Manifold:
-    """A part of height 1 along z, moved and turned to run from start to end; its radii stay."""
-    start = np.asarray(start, float)
-    axis = np.asarray(end, float) - start
-    direction = _unit(axis)
-    helper = np.array([1.0, 0, 0]) if abs(direction[0]) < 0.9 else np.array([0, 1.0, 0])
-    x = _unit(np.cross(helper, direction))
-    return unit.transform(np.column_stack([x, np.cross(direction, x), axis, start]))

@@ -61,7 +61,7 @@ class Fuselage:
         centre = cap.mean(0)
         for share in (0.8, 0.4):
             body.append(centre + (cap - centre) * share + [0, 0.6 * self.radius * self.end * (1 - share), 0])
-        return parts.loft(np.array(body))
+        return parts.loft(body)
 
     def _phases(self, y: float) -> tuple[float, float]:
         """How far y lies into the nose and into the tail, each 0 in the cabin and 1 at the end."""
@@ -80,15 +80,6 @@ def superellipse(segments: int, power: float) -> np.ndarray:
     return np.sign(unit) * np.abs(unit) ** (2 / power)
 
 
-@dataclass(frozen=True)
-class Station:
-    """One section of a lifting surface: leading edge, chord, and the roll of its thickness (0: a wing's)."""
-
-    leading_edge: parts.Point
-    chord: float
-    roll: float = 0.0
-
-
 def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
     """Places along a section of unit chord and thickness, and half its thickness there (NACA report 460)."""
     x = (1 - np.cos(np.linspace(0, np.pi, points))) / 2
@@ -96,39 +87,41 @@ def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
     return x, 5 * np.array([0.2969, -0.126, -0.3516, 0.2843, -0.1036]) @ powers
 
 
-def lifting_surface(stations: list[Station], ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
-    """A wing, fin or tailplane through its stations, with a blunt trailing edge of 0.8 `gauge`, the least
-    thickness. `ratio` is thickness over chord, `camber` that of the mean line in chords."""
+def lifting_surface(stations, ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
+    """A wing, fin or tailplane with a blunt trailing edge of 0.8 `gauge`, the least thickness.
+
+    It runs through stations (leading edge [3], chord, roll of the thickness, 0 for a level wing); `ratio` is
+    thickness over chord, `camber` that of the mean line in chords.
+    """
     along, half = aerofoil()
     sections = []
-    for s in stations:
-        thick = max(ratio * s.chord, 1.15 * gauge)
+    for leading_edge, chord, roll in stations:
+        thick = max(ratio * chord, 1.15 * gauge)
         offset = np.maximum(thick * half, 0.4 * gauge * np.minimum(1, 4 * np.sqrt(along)))
-        mean = 4 * camber * s.chord * along * (1 - along)
-        y = np.concatenate([along, along[:0:-1]]) * s.chord
+        mean = 4 * camber * chord * along * (1 - along)
+        y = np.concatenate([along, along[:0:-1]]) * chord
         up = np.concatenate([mean + offset, (mean - offset)[:0:-1]])
-        across = np.outer(up, [-np.sin(s.roll), 0, np.cos(s.roll)])
-        sections.append(np.array(s.leading_edge) + across + np.outer(y, [0, 1, 0]))
-    return parts.loft(np.array(sections))
+        across = np.outer(up, [-np.sin(roll), 0, np.cos(roll)])
+        sections.append(leading_edge + across + np.outer(y, [0, 1, 0]))
+    return parts.loft(sections)
 
 
 def panel(root, direction, length: float, chords, sweep: float, ratio: float, gauge: float) -> Manifold:
     """A tapered surface with a rounded tip, `length` long from a leading-edge point `root` along a direction
     [2] in x, z; chords are at root and tip, `sweep` is of the leading edge in degrees."""
-    roll = np.arctan2(direction[1], direction[0])
-    back = np.tan(np.radians(sweep))
+    roll, back = np.arctan2(direction[1], direction[0]), np.tan(np.radians(sweep))
     stations = []
     for share, trim in ((0, 0), (0.5, 0), (0.94, 0), (1, 0.14)):
         chord = chords[0] + share * (chords[1] - chords[0])
         x, z = np.array([root[0], root[2]]) + share * length * np.asarray(direction)
         y = root[1] + share * length * back + trim * chord
-        stations.append(Station((x, y, z), chord * (1 - 1.4 * trim), roll))
+        stations.append(((x, y, z), chord * (1 - 1.4 * trim), roll))
     return lifting_surface(stations, ratio, gauge)
 
 
 def body_of_revolution(profile, centre, segments: int = 18) -> Manifold:
     """A lathe along y around `centre`; `profile` holds (radius, y) from the front axis to the rear axis."""
-    return parts.lathe(profile, segments).rotate((-90.0, 0.0, 0.0)).translate(tuple(map(float, centre)))
+    return parts.lathe(profile, segments).rotate((-90.0, 0.0, 0.0)).translate(centre)
 
 
 def jet(radius: float, length: float, centre) -> Manifold:
@@ -145,38 +138,33 @@ def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn
     centre; the first blade stands at `turn` degrees."""
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
     made = [body_of_revolution(parts.scaled(profile, hub, hub), centre, 14)]
-    chord = max(0.22 * radius, 2.2 * gauge)
-    sections = []
+    chord, sections = max(0.22 * radius, 2.2 * gauge), []
     stations = (0.0, 0.5, 60), (0.3, 0.8, 45), (0.6, 1.0, 28), (0.92, 0.85, 18), (1, 0.5, 16)
     for share, width, twist in stations:
         ring = superellipse(10, 2.5) * [width * chord / 2, gauge / 2]
         c, s = np.cos(np.radians(twist)), np.sin(np.radians(twist))
-        flat = ring @ np.array([[c, s], [-s, c]])
-        sections.append(np.column_stack([flat, np.full(len(ring), share * radius)]))
-    blade = parts.loft(np.array(sections))
-    for k in range(blades):
-        made.append(blade.rotate((0.0, turn + 360.0 * k / blades, 0.0)).translate(tuple(map(float, centre))))
-    return made
+        sections.append(parts.level(ring @ np.array([[c, s], [-s, c]]), share * radius))
+    blade = parts.loft(sections)
+    turns = [turn + 360.0 * k / blades for k in range(blades)]
+    return made + [blade.rotate((0.0, angle, 0.0)).translate(centre) for angle in turns]
 
 
 def wheel(radius: float, width: float, centre) -> Manifold:
     """A tyre with rounded shoulders, its axle along x."""
     r, w = radius, width / 2
     profile = [(0.55 * r, -w), (0.84 * r, -w), (r, -0.5 * w), (r, 0.5 * w), (0.84 * r, w), (0.55 * r, w)]
-    return parts.lathe(profile, 16).rotate((0.0, 90.0, 0.0)).translate(tuple(map(float, centre)))
+    return parts.lathe(profile, 16).rotate((0.0, 90.0, 0.0)).translate(centre)
 
 
-def canopy(front: float, back: float, peak: float, base, half_width: float, height: float) -> Manifold:
-    """A bubble on the height base(y): a fighter's canopy, a light aircraft's cabin. It is highest, and
-    `half_width` wide to either side, at the share `peak` of its length."""
-    unit = superellipse(16, 2.4)
-    sections = []
+def canopy(body, front: float, back: float, peak: float, foot: float, half_width: float, height: float):
+    """A bubble on a body from `foot` half heights above its axis: a fighter's canopy, a light aircraft's
+    cabin. It is highest, and `half_width` wide to either side, at the share `peak` of its length."""
+    unit, sections = superellipse(16, 2.4), []
     for t in (1 - np.cos(np.linspace(0.12, np.pi - 0.12, 11))) / 2:
         side = (peak - t) / peak if t < peak else (t - peak) / (1 - peak)
-        rise = (1 - side**2) ** 0.62
-        y = front + t * (back - front)
+        rise, y = (1 - side**2) ** 0.62, front + t * (back - front)
         wide = half_width * (0.3 + 0.7 * rise)
-        ring = unit * [wide, 1.0]
-        z = base(y) + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
-        sections.append(np.column_stack([ring[:, 0], np.full(len(unit), y), z]))
-    return parts.loft(np.array(sections))
+        base = body.axis(y) + foot * body.half_height(y)
+        z = base + np.where(unit[:, 1] > 0, height * rise, 0.35 * wide) * unit[:, 1]
+        sections.append(np.column_stack([wide * unit[:, 0], np.full(len(unit), y), z]))
+    return parts.loft(sections)

@@ -1,21 +1,20 @@
 """Aircraft: airliners, business jets, turboprops, light singles, gliders, fighters; one set of parameters."""
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from manifold3d import Manifold
 
-from sdfhub.procedural import parts, plane_engines, plane_gear, plane_tails
+from sdfhub.procedural import parts, plane_engines, plane_tails
 from sdfhub.procedural import plane_parts as pp
-from sdfhub.procedural.parameters import choice, continuous
 
 
 class Proportions(NamedTuple):
     """What makes a kind of aircraft that kind; lengths in fuselage lengths, angles in degrees."""
 
     length: float  # metres
-    body: pp.Fuselage
     span: float
     chord: float
     taper: float
@@ -27,150 +26,70 @@ class Proportions(NamedTuple):
 
 
 KINDS = {
-    "airliner": Proportions(
-        38,
-        pp.Fuselage(0.052, 1, 0.12, 0.38, 0.06, 0.16, 0.55, 1.15, 2),
-        0.96,
-        0.22,
-        0.26,
-        31,
-        -0.13,
-        1.0,
-        0.06,
-        0.019,
-    ),
-    "business jet": Proportions(
-        18,
-        pp.Fuselage(0.06, 1, 0.2, 0.42, 0.07, 0.18, 0.62, 1.1, 2),
-        0.94,
-        0.2,
-        0.32,
-        28,
-        -0.06,
-        1.0,
-        0.05,
-        0.018,
-    ),
-    "turboprop": Proportions(
-        25,
-        pp.Fuselage(0.056, 1.05, 0.14, 0.4, 0.1, 0.2, 0.55, 1.1, 2.2),
-        1.08,
-        0.13,
-        0.5,
-        4,
-        -0.1,
-        1.05,
-        0.06,
-        0.021,
-    ),
-    "single": Proportions(
-        8,
-        pp.Fuselage(0.07, 1.12, 0.16, 0.62, 0.62, 0.2, 0.5, 0.9, 2.7),
-        1.3,
-        0.18,
-        0.72,
-        2,
-        -0.2,
-        1.1,
-        0.085,
-        0.031,
-    ),
-    "glider": Proportions(
-        7,
-        pp.Fuselage(0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1),
-        1.75,
-        0.125,
-        0.42,
-        1.5,
-        -0.16,
-        1.0,
-        0.014,
-        0.03,
-    ),
-    "fighter": Proportions(
-        15,
-        pp.Fuselage(0.054, 1.0, 0.36, 0.3, 0.05, 0.8, 0.75, 1.0, 2.4),
-        0.66,
-        0.4,
-        0.16,
-        46,
-        -0.06,
-        1.05,
-        0.055,
-        0.022,
-    ),
+    "airliner": Proportions(38, 0.96, 0.22, 0.26, 31, -0.13, 1.0, 0.06, 0.019),
+    "business jet": Proportions(18, 0.94, 0.2, 0.32, 28, -0.06, 1.0, 0.05, 0.018),
+    "turboprop": Proportions(25, 1.08, 0.13, 0.5, 4, -0.1, 1.05, 0.06, 0.021),
+    "single": Proportions(8, 1.3, 0.18, 0.72, 2, -0.2, 1.1, 0.085, 0.031),
+    "glider": Proportions(7, 1.75, 0.125, 0.42, 1.5, -0.16, 1.0, 0.014, 0.03),
+    "fighter": Proportions(15, 0.66, 0.4, 0.16, 46, -0.06, 1.05, 0.055, 0.022),
+}
+BODIES = {
+    "airliner": pp.Fuselage(0.052, 1, 0.12, 0.38, 0.06, 0.16, 0.55, 1.15, 2),
+    "business jet": pp.Fuselage(0.06, 1, 0.2, 0.42, 0.07, 0.18, 0.62, 1.1, 2),
+    "turboprop": pp.Fuselage(0.056, 1.05, 0.14, 0.4, 0.1, 0.2, 0.55, 1.1, 2.2),
+    "single": pp.Fuselage(0.07, 1.12, 0.16, 0.62, 0.62, 0.2, 0.5, 0.9, 2.7),
+    "glider": pp.Fuselage(0.058, 1.15, 0.24, 0.6, 0.1, 0.3, 0.6, 0.75, 2.1),
+    "fighter": pp.Fuselage(0.054, 1.0, 0.36, 0.3, 0.05, 0.8, 0.75, 1.0, 2.4),
 }
 
 
-@dataclass(frozen=True)
-class Plane:
+class Plane(SimpleNamespace):
     """One aircraft, its nose towards -y. Numbers scale or shift the proportions of its kind; what a kind
     cannot have is read as its nearest: a jet with a tail wheel stands on a nose wheel."""
 
-    kind: str = choice(*KINDS)
-    mount: str = choice("low", "low", "mid", "high", "high")
-    tail: str = choice("conventional", "conventional", "t", "v", "twin", "cruciform")
-    gear: str = choice("tricycle", "taildragger", "retracted", "retracted")
-    tips: str = choice("plain", "winglet", "tank")
-    engines: int = choice(1, 1, 2)
-    blades: int = choice(2, 3, 4)
-    spats: bool = choice(True, False)
-    size: float = continuous(0.8, 1.25)
-    girth: float = continuous(0.88, 1.15)
-    nose_length: float = continuous(0.8, 1.3)
-    nose_droop: float = continuous(0.0, 0.45)
-    upsweep: float = continuous(0.3, 0.9)
-    span: float = continuous(0.88, 1.12)
-    chord: float = continuous(0.88, 1.15)
-    taper: float = continuous(0.8, 1.25)
-    sweep: float = continuous(-4.0, 7.0)
-    dihedral: float = continuous(1.0, 6.5)
-    wing_shift: float = continuous(-0.03, 0.03)
-    tail_size: float = continuous(0.88, 1.15)
-    fin_sweep: float = continuous(-8.0, 10.0)
-    engine_size: float = continuous(0.88, 1.15)
-    engine_shift: float = continuous(-0.04, 0.05)
-    canopy_height: float = continuous(0.85, 1.25)
-    winglet_height: float = continuous(0.1, 0.17)
-    blade_turn: float = continuous(0.0, 90.0)
+    parameters: ClassVar = dict(
+        kind=list(KINDS), mount=["low", "low", "mid", "high", "high"],
+        tail=["conventional", "conventional", "t", "v", "twin", "cruciform"],
+        gear=["tricycle", "taildragger", "retracted", "retracted"], tips=["plain", "winglet", "tank"],
+        engines=[1, 1, 2], blades=[2, 3, 4], spats=[True, False], size=(0.8, 1.25), girth=(0.88, 1.15),
+        nose_length=(0.8, 1.3), nose_droop=(0.0, 0.45), upsweep=(0.3, 0.9), span=(0.88, 1.12),
+        chord=(0.88, 1.15), taper=(0.8, 1.25), sweep=(-4.0, 7.0), dihedral=(1.0, 6.5),
+        wing_shift=(-0.03, 0.03), tail_size=(0.88, 1.15), fin_sweep=(-8.0, 10.0), engine_size=(0.88, 1.15),
+        engine_shift=(-0.04, 0.05), canopy_height=(0.85, 1.25), winglet_height=(0.1, 0.17),
+        blade_turn=(0.0, 90.0),
+    )  # fmt: skip
 
     def build(self) -> Manifold:
         """The aircraft as one solid."""
+        self._measure()
         body = self.body.solid()
         if self.kind in ("airliner", "business jet", "turboprop"):
             body = self._windscreen(body)
         solids = [body, *self._wing(), *plane_tails.tail(self), *plane_engines.powerplant(self)]
-        whole = parts.union([*solids, *self._canopy(), *plane_gear.gear(self)])
+        whole = parts.union([*solids, *self._canopy(), *plane_engines.gear(self)])
         return whole.scale((self.base.length * self.size,) * 3)
 
-    @property
-    def base(self) -> Proportions:
-        """The proportions of its kind."""
-        return KINDS[self.kind]
-
-    @property
-    def gauge(self) -> float:
-        """Thickness of its thinnest parts: a share of the bounding radius, so that they can be sampled."""
-        return 0.0092 * max(1.06, self.base.span * self.span)
-
-    @property
-    def body(self) -> pp.Fuselage:
-        """Its fuselage."""
-        b = self.base.body
+    def _measure(self) -> None:
+        """Sets what several parts share: proportions, fuselage, least thickness, half span, sweeps."""
+        self.base, b = KINDS[self.kind], BODIES[self.kind]
+        # A share of the bounding radius, so that the thinnest parts can be sampled.
+        self.gauge = 0.0092 * max(1.06, self.base.span * self.span)
         upsweep = 0.4 * self.upsweep if self.kind in ("fighter", "single") else self.upsweep
         nose, radius = b.nose * self.nose_length, b.radius * self.girth
         end = max(b.end, 1.3 * self.gauge / radius)
-        return replace(b, radius=radius, nose=nose, end=end, upsweep=upsweep, droop=self.nose_droop)
-
-    @property
-    def semi_span(self) -> float:
-        """From the centre line to the wing's tip."""
-        return self.base.span * self.span / 2
+        self.body = replace(b, radius=radius, nose=nose, end=end, upsweep=upsweep, droop=self.nose_droop)
+        self.semi_span = self.base.span * self.span / 2
+        straight = self.kind in ("turboprop", "single", "glider")
+        self.wing_sweep = self.base.sweep + (0.3 if straight else 1.0) * self.sweep
+        fast = self.kind in ("airliner", "business jet", "fighter")
+        self.fin_angle = (40 if fast else 24) + self.fin_sweep
+        self.tail_angle = (34 if fast else 8) + 0.5 * self.fin_sweep
+        self.tail_scale = self.base.tail_size * self.tail_size
 
     def leading_edge(self, share: float) -> np.ndarray:
         """[3] point of the right wing's leading edge; share 0 is the centre line, 1 the tip."""
         x = share * self.semi_span
-        y = self.base.wing + self.wing_shift + x * np.tan(np.radians(self._sweep))
+        y = self.base.wing + self.wing_shift + x * np.tan(np.radians(self.wing_sweep))
         half, high = self.body.half_height(0), {"low": -0.62, "mid": 0.0, "high": 0.72}[self.mount]
         if self.kind == "single" and self.mount == "high":
             high = 1 + 0.38 * self.canopy_height
@@ -185,24 +104,19 @@ class Plane:
         tip = root * self.base.taper * self.taper
         if self.kind not in ("airliner", "business jet"):
             return root + share * (tip - root)
-        kink = max(root - 0.95 * 0.36 * self.semi_span * np.tan(np.radians(self._sweep)), 1.25 * tip)
+        kink = max(root - 0.95 * 0.36 * self.semi_span * np.tan(np.radians(self.wing_sweep)), 1.25 * tip)
         return float(np.interp(share, [0, 0.36, 1], [root, kink, tip]))
 
     def wing_point(self, share: float, along: float = 0.4) -> np.ndarray:
         """[3] point inside the right wing, `along` chords behind its leading edge."""
         return self.leading_edge(share) + [0, along * self.wing_chord(share), 0]
 
-    @property
-    def _sweep(self) -> float:
-        straight = self.kind in ("turboprop", "single", "glider")
-        return self.base.sweep + (0.3 if straight else 1.0) * self.sweep
-
     def _wing(self) -> list[Manifold]:
         roll = np.arctan2(*(self.leading_edge(1) - self.leading_edge(0))[[2, 0]])
-        half = [pp.Station(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
+        half = [(self.leading_edge(s), self.wing_chord(s), roll) for s in (0.36, 0.7, 0.97)]
         half += self._wing_tip(roll)
-        left = [pp.Station(s.leading_edge * np.array([-1, 1, 1]), s.chord, -s.roll) for s in reversed(half)]
-        middle = pp.Station(self.leading_edge(0), self.wing_chord(0))
+        left = [(edge * [-1, 1, 1], chord, -turn) for edge, chord, turn in reversed(half)]
+        middle = self.leading_edge(0), self.wing_chord(0), 0.0
         ratio = 0.06 if self.kind == "fighter" else 0.13
         wing = pp.lifting_surface([*left, middle, *half], ratio, self.gauge, 0.0 if ratio < 0.1 else 0.015)
         if self.tips != "tank" or self.kind in ("airliner", "glider"):
@@ -212,15 +126,15 @@ class Plane:
         tank = pp.body_of_revolution(parts.scaled(shape, r, a), self.wing_point(0.99, 0.5), 16)
         return [wing, *parts.mirrored(tank)]
 
-    def _wing_tip(self, roll: float) -> list[pp.Station]:
+    def _wing_tip(self, roll: float) -> list[tuple[np.ndarray, float, float]]:
         """Sections beyond 97% of the half span: rounded off, or turned up into a winglet."""
         tip, chord = self.leading_edge(1), self.wing_chord(1)
         if self.tips != "winglet" or self.kind in ("fighter", "single"):
-            return [pp.Station(tip + [0, 0.12 * chord, 0], 0.8 * chord, roll)]
+            return [(tip + [0, 0.12 * chord, 0], 0.8 * chord, roll)]
         tall, stations = self.winglet_height * self.semi_span, []
         for up, out, trim, turn in ((0.06, 0.12, 0.06, 0.45), (0.22, 0.24, 0.2, 0.9), (1.0, 0.5, 0.8, 1.0)):
             point = tip + np.array([out * tall, trim * min(chord, tall), up * tall])
-            stations.append(pp.Station(point, chord * (1 - 0.55 * trim), roll + turn * (1.2 - roll)))
+            stations.append((point, chord * (1 - 0.55 * trim), roll + turn * (1.2 - roll)))
         return stations
 
     def _windscreen(self, body: Manifold) -> Manifold:
@@ -243,8 +157,4 @@ class Plane:
         else:
             radii = 0.92 * body.radius, 0.75 * self.wing_chord(0), 0.5 * body.radius
             return [parts.ellipsoid(radii, self.wing_point(0, 0.5) * [0, 1, 0.95], 20)]
-
-        def base(y: float) -> float:
-            return body.axis(y) + foot * body.half_height(y)
-
-        return [pp.canopy(front, rear, peak, base, wide * body.radius, high)]
+        return [pp.canopy(body, front, rear, peak, foot, wide * body.radius, high)]

@@ -1,7 +1,4 @@
-"""When a fit is doubtful: where unseen shapes of a run's own data, scanned alike, fit better.
-
-A run keeps its calibrations in `calibration.json`, one a kind of scan, so that each is measured once.
-"""
+"""When a fit is doubtful: where unseen shapes of a run's data, scanned alike, fit better; kept in the run."""
 
 import hashlib
 import json
@@ -11,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeInt, PositiveFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 from tqdm import tqdm
 
@@ -26,8 +23,7 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
-# what is judged: limits of another rule are not taken for these
-RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"
+RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"  # limits of others count no more
 
 
 @dataclass(frozen=True)
@@ -58,41 +54,31 @@ class Calibration:
     ) -> dict[ScanKind, Limits]:
         """The limits of kinds of scans: the run's own, or measured now and kept in its folder.
 
-        Args:
-            run, settings: its folder; plain data of all that fits depend on.
-            kinds, reconstructor: which are wanted; fits scans.
-            unseen_shapes: up to so many shapes of the run's data that it was not trained on.
+        `settings` are all that fits depend on, `unseen_shapes` gives up to so many shapes of the run's data.
         """
         key = digest(run, settings)
-        known = _read(run / FILE).get(key, {})
+        kept = _read(run / FILE)
+        known = kept.setdefault(key, {})
         missing = [kind for kind in kinds if "limits" not in known.get(str(kind), {})]
         shapes = unseen_shapes(self.shapes) if missing else []
         if missing and len(shapes) < 3:
             raise SdfhubError(f"the run's data has {len(shapes)} unseen shapes, a calibration needs 3")
         for kind in missing:
             log.info("calibration: %s: fits %d unseen shapes, once", kind, len(shapes))
-            entry = self._measured(kind, shapes, reconstructor)
-            kept = _read(run / FILE)  # again: another process may have added to it meanwhile
-            known = kept.get(key, {}) | known | {str(kind): entry}
+            residuals, doubts = [], []
+            scans = kind.observations(shapes, reconstructor.evidence)
+            for scan in tqdm(scans, desc="calibrating", unit="scan", leave=False, disable=None):
+                fitted = reconstructor.fitted([scan])
+                residuals.append(float(fitted.residuals))
+                doubts.append(float(reconstructor.doubts(fitted)))
+            found = {"residual": self.limit(np.array(residuals)), "doubt": self.limit(np.array(doubts))}
+            known[str(kind)] = {"limits": found, "residuals": residuals, "doubts": doubts}
+            known[str(kind)]["shapes"] = [shape.id for shape in shapes]
             try:
-                write_whole(run / FILE, json.dumps(kept | {key: known}, indent=1))
+                write_whole(run / FILE, json.dumps(kept, indent=1))
             except OSError as error:  # another user's run: the limits serve this command at least
                 log.warning("%s: is not kept: %s", run / FILE, error.strerror)
         return {kind: Limits(**known[str(kind)]["limits"]) for kind in kinds}
-
-    def _measured(
-        self, kind: ScanKind, shapes: Sequence[StoredShape], reconstructor: Reconstructor
-    ) -> dict[str, Any]:
-        """Limits for a kind of scan, and the residuals and doubts of unseen shapes that they come from."""
-        scans = kind.observations(shapes, reconstructor.evidence)
-        residuals, doubts = [], []
-        for scan in tqdm(scans, desc="calibrating", unit="scan", leave=False, disable=None):
-            fitted = reconstructor.fitted([scan])
-            residuals.append(float(fitted.residuals))
-            doubts.append(float(reconstructor.doubts(fitted)))
-        limits = {"residual": self.limit(np.array(residuals)), "doubt": self.limit(np.array(doubts))}
-        ids = [shape.id for shape in shapes]
-        return {"limits": limits, "residuals": residuals, "doubts": doubts, "shapes": ids}
 
 
 def digest(run: Path, settings: dict[str, Any]) -> str:
@@ -105,7 +91,6 @@ def digest(run: Path, settings: dict[str, Any]) -> str:
 def _read(path: Path) -> dict[str, Any]:
     """What is kept; nothing where the file is missing or broken, which costs a calibration."""
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        return {key: {kind: dict(entry) for kind, entry in kinds.items()} for key, kinds in kept.items()}
-    except (OSError, ValueError, AttributeError, TypeError):
+        return TypeAdapter(dict[str, dict[str, dict[str, Any]]]).validate_json(path.read_bytes())
+    except (OSError, ValueError):
         return {}

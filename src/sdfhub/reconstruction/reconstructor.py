@@ -1,7 +1,4 @@
-"""Scans through a trained space: observed, fitted, meshed in their own frames, judged, written one by one.
-
-A result is NAME.ply, NAME.json and a line of a table.
-"""
+"""Scans through a trained space: observed, fitted, meshed in their own frames, judged, written."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,6 +48,9 @@ class Result:
     frame: tuple[tuple[float, ...], ...] = ()  # matrix [4][4] from the normalised frame to the scan's
     mesh: str | None = None  # file name; None without a surface
 
+    def write(self, out: Path) -> None:
+        write_whole(out / f"{self.name}.json", json.dumps(asdict(self), indent=1))
+
     def judged(self, limits: Limits | None, is_near: bool) -> "Result":
         """The same with a verdict; `is_near` tells whether its pose lies within the range of poses."""
         verdict: Verdict = "doubtful"
@@ -65,10 +65,6 @@ class Result:
             reason = ", ".join(f"{name} {x:.2f} x its limit" for name, x in shares.items() if not x <= 1)
             verdict = "doubtful" if reason else "fitted"
         return replace(self, limits=limits, verdict=verdict, reason=reason)
-
-    def write(self, out: Path) -> None:
-        """Writes NAME.json into a folder."""
-        write_whole(out / f"{self.name}.json", json.dumps(asdict(self), indent=1))
 
 
 @dataclass(frozen=True)
@@ -98,10 +94,7 @@ class Reconstructor:
         return self.fit(self.space.decoder, self.space.codes, observations, self.space.delta, self.poses)
 
     def doubts(self, fitted: Fitted) -> Tensor:
-        """[B] residuals, each times the fourth power of one plus how unusual its code is.
-
-        A space can bend to a stranger: its residual is small, but its code lies far from all known ones.
-        """
+        """[B] residuals * (1 + unusual)^4: the residual of a stranger may be small, its code is far off."""
         return fitted.residuals * (1 + self.space.unusual(fitted.codes)) ** 4
 
     def meshes(self, scans: Sequence[ObservedScan], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
@@ -113,10 +106,7 @@ class Reconstructor:
     def reconstruct(
         self, scans: Mapping[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path, together: int
     ) -> Iterator[Result]:
-        """Fits and meshes scans by name, `together` side by side, and writes NAME.ply and NAME.json of each.
-
-        One that fails does not stop the others.
-        """
+        """Fits scans by name, `together` at once, and writes NAME.ply and NAME.json; failures stop none."""
         names = list(scans)
         for first in range(0, len(names), together):
             group = {name: scans[name] for name in names[first : first + together]}
@@ -128,9 +118,7 @@ class Reconstructor:
                 else:  # alone, each shows whether it is the one that fails
                     yield from self.reconstruct(group, limits, out, 1)
 
-    def _reconstruct_group(
-        self, group: dict[str, ObservedScan], limits: Mapping[ScanKind, Limits], out: Path
-    ) -> list[Result]:
+    def _reconstruct_group(self, group: Mapping, limits: Mapping, out: Path) -> list[Result]:
         scans, results = list(group.values()), []
         fitted = self.fitted(scans)
         doubts = self.doubts(fitted)
@@ -147,8 +135,8 @@ class Reconstructor:
                 mesh=f"{name}.ply" if len(mesh.faces) else None,
             )
             results.append(result.judged(limits.get(kind), bool(near[row])))
-            write_mesh(*mesh, out / f"{name}.ply")
-            results[-1].write(out)  # last: a result is whole when it is described
+            write_mesh(*mesh, out / f"{name}.ply")  # before: a result is whole when it is described
+            results[-1].write(out)
         return results
 
 
@@ -164,11 +152,9 @@ def to_scan(scan: ObservedScan, fitted: Fitted, row: int) -> np.ndarray:
 
 def is_result(path: Path) -> bool:
     """Whether a mesh is the result of an earlier command: the JSON beside it says so."""
-    try:
-        content = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and "verdict" in content and content.get("mesh") == path.name
+    beside = path.with_suffix(".json")
+    words = '"verdict": ', f'"mesh": {json.dumps(path.name)}'
+    return beside.is_file() and all(word in beside.read_text("utf-8", "replace") for word in words)
 
 
 def table(results: Sequence[Result]) -> str:

@@ -7,7 +7,7 @@ cell's files is run, and no link is followed out of its folder.
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -125,12 +125,12 @@ class Training(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class Scores:
-    """The scores of a finished cell; nothing is in those of another."""
+    """The scores of a finished cell."""
 
-    shapes: dict[str, list[ShapeScore] | list[DistanceScore]] = field(default_factory=dict)  # by role
-    training: Training = field(default_factory=lambda: Training(seconds=0, steps=0, parameters=0))
-    trained_on: int = 0  # shapes, without augmented copies
-    config: dict[str, Any] = field(default_factory=dict)  # of config.yaml
+    shapes: dict[str, list[ShapeScore] | list[DistanceScore]]  # by role
+    training: Training
+    trained_on: int  # shapes, without augmented copies
+    config: dict[str, Any]  # of config.yaml
 
     def costs(self) -> dict[str, float]:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
@@ -154,7 +154,7 @@ class Cell:
     folder: Path
     state: Literal["done", "failed", "missing"]
     reason: str = ""  # why it is not done
-    scores: Scores = Scores()
+    scores: Scores = Scores({}, Training(seconds=0, steps=0, parameters=0), 0, {})
 
 
 def read_sweep(sweep: Path) -> list[Cell]:

@@ -1,6 +1,7 @@
 """Cells become rows: one row a method, its seeds together; one group for what may be compared."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -39,7 +40,8 @@ class Row:
 
     def __post_init__(self) -> None:
         words = {"on": " + normals", "off": ", no normals" if self.method != "DeepSDF" else ""}
-        self.label = self.method + words.get(self.normals, "") + (f" ({self.detail})" if self.detail else "")
+        ending = words.get(self.normals, f", normals {self.normals}")  # labels name rows: no two are equal
+        self.label = self.method + ending + (f" ({self.detail})" if self.detail else "")
         self.done = [cell for cell in self.cells if cell.state == "done"]
         self.first = self.done[0] if self.done else None
         # what stands for a row without finished cells, and what search its settings come from
@@ -128,48 +130,42 @@ def differing(settings: list[dict[str, Any]]) -> dict[str, tuple[str, ...]]:
 
 def group_cells(cells: list[Cell]) -> list[Group]:
     """The cells of a sweep as groups of rows."""
-    members: dict[tuple, list[Cell]] = {}
-    for cell in cells:
-        members.setdefault(tuple(_judging(cell).items()), []).append(cell)
+    members = _apart(cells, lambda cell: tuple(_judging(cell).items()))
     return [Group(dict(judging), _rows(cells)) for judging, cells in members.items()]
 
 
+def _apart(cells: list[Cell], key: Callable[[Cell], Any]) -> dict[Any, list[Cell]]:
+    parts: dict[Any, list[Cell]] = {}
+    for cell in cells:
+        parts.setdefault(key(cell), []).append(cell)
+    return parts
+
+
 def _judging(cell: Cell) -> dict[str, str]:
-    choices = {name: cell.plan.choices[name] for name in JUDGING_GROUPS if name in cell.plan.choices}
-    settings = {k: v for k, v in sorted(cell.plan.settings.items()) if k.startswith(JUDGING_SETTINGS)}
-    return choices | {k: v for k, v in settings.items() if not k.startswith("data.loader.")}
+    choices, settings = cell.plan.choices, cell.plan.settings
+    keys = sorted(k for k in settings if k.startswith(JUDGING_SETTINGS) and not k.startswith("data.loader."))
+    return {k: choices[k] for k in JUDGING_GROUPS if k in choices} | {k: settings[k] for k in keys}
 
 
 def _rows(cells: list[Cell]) -> list[Row]:
     shared = set.intersection(*(set(cell.plan.settings.items()) for cell in cells))
-    commands: dict[tuple, list[Cell]] = {}
-    for cell in cells:
-        commands.setdefault(cell.plan.identity[:2], []).append(cell)
     rows: list[Row] = []
-    for members in commands.values():
+    for members in _apart(cells, lambda cell: cell.plan.identity[:2]).values():
         plan = members[0].plan
         namesakes = [cell.plan.choices for cell in cells if _name(cell.plan.choices) == _name(plan.choices)]
         own = dict(pair for pair in plan.settings.items() if pair not in shared)
         own |= {key: plan.choices.get(key, NONE) for key in differing(namesakes)}
-        parts = _by_settings(members)
+        # seeds of one command line stand apart where defaults changed; unfinished ones with the last
+        done = [cell for cell in members if cell.state == "done"]
+        parts = list(_apart(done, lambda cell: str(settings_of(cell))).values()) or [[]]
+        parts[-1] += [cell for cell in members if cell.state != "done"]
         changed = differing([settings_of(part[0]) for part in parts])
         for number, part in enumerate(parts):
             words = own | {key.partition(",")[0]: values[number] for key, values in changed.items()}
             detail = ", ".join(f"{key}={value}" for key, value in words.items())
-            row = Row(*_name(plan.choices), detail, part)
-            twins = sum(row.label == rival.label for rival in rows)  # labels name rows: no two are equal
-            rows.append(replace(row, detail=f"{detail}, {twins + 1}") if twins else row)
+            rows.append(Row(*_name(plan.choices), detail, part))
     methods = list(dict.fromkeys(row.method for row in rows))
     return sorted(rows, key=lambda row: (methods.index(row.method), row.normals != "on"))
-
-
-def _by_settings(cells: list[Cell]) -> list[list[Cell]]:
-    """Seeds of one command line, apart where defaults changed between them; unfinished ones with the last."""
-    parts: dict[str, list[Cell]] = {}
-    for cell in sorted(cells, key=lambda cell: cell.state != "done"):
-        key = str(settings_of(cell)) if cell.state == "done" else next(reversed(parts), "")
-        parts.setdefault(key, []).append(cell)
-    return list(parts.values())
 
 
 def _name(choices: dict[str, str]) -> tuple[str, str]:

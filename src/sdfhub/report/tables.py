@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 
@@ -48,7 +49,15 @@ def tables(group: Group) -> list[Table]:
     """The tables of a group: scores by role, differing settings, costs, and the cells without scores."""
     kinds = (("", SURFACES, ABOUT_CD), (", signed distances", DISTANCES, ABOUT_DISTANCES))
     scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
-    return [table for table in (*scores, _settings(group), _costs(group), _absent(group)) if table]
+    first = {row.label: settings_of(row.first) for row in group.rows if row.first}
+    lines = sorted((key, *values) for key, values in differing(list(first.values())).items())
+    settings = pd.DataFrame(lines, columns=["setting", *first])
+    cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
+    reasons = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
+    absent = pd.DataFrame(reasons, columns=["cell", "state", "reason"])
+    prose = [Table("Settings that differ", settings, ABOUT_SETTINGS, prose=True), _costs(group)]
+    prose += [Table("Not there", absent, prose=True)]
+    return [table for table in (*scores, *prose) if table and len(table.frame)]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -65,8 +74,9 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = ["{}, {}{}".format(*parts) for parts in zip(means, medians, seeds, strict=True)]
-            texts = [NONE if text == f"{NONE}, {NONE}" else text for text in texts]
+            texts = [
+                NONE if a == NONE else f"{a}, {b}{n}" for a, b, n in zip(means, medians, seeds, strict=True)
+            ]
             frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
         if (frame.iloc[:, 1:] != NONE).any(axis=None):
             overviews.append(Table(f"{TITLES[role]}, excess", frame, ABOUT_OVERVIEW))
@@ -109,13 +119,6 @@ def _scores(group: Group, role: str, title: str, quantities: dict[str, str], abo
     return Table(TITLES[role] + title, _frame(group, columns), about, best)
 
 
-def _settings(group: Group) -> Table | None:
-    rows = {row.label: settings_of(row.first) for row in group.rows if row.first}
-    lines = sorted((key, *values) for key, values in differing(list(rows.values())).items())
-    frame = pd.DataFrame(lines, columns=["setting", *rows])
-    return Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True) if lines else None
-
-
 def _costs(group: Group) -> Table:
     lines = group.costs.reindex([row.label for row in group.rows])
     names = {"shapes": "trained_on"} | {name: name for name in ("parameters", "epochs", "steps", "samples")}
@@ -125,13 +128,6 @@ def _costs(group: Group) -> Table:
         for mean, half in zip(lines["seconds"], lines["seconds_ci95"], strict=True)
     ]
     return Table("Cost", _frame(group, columns), ABOUT_COSTS)
-
-
-def _absent(group: Group) -> Table | None:
-    cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
-    lines = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
-    frame = pd.DataFrame(lines, columns=["cell", "state", "reason"])
-    return Table("Not there", frame, prose=True) if lines else None
 
 
 def _frame(group: Group, columns: dict[str, list[str]]) -> pd.DataFrame:
@@ -171,16 +167,15 @@ def markdown(title: str, tables: list[Table]) -> str:
 
 def latex(sections: list[tuple[str, list[Table]]]) -> str:
     """A document of titled tables that compiles; each table can be copied out (booktabs)."""
-    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs,graphicx}"]
-    lines += [r"\usepackage[landscape,margin=1.5cm]{geometry}", r"\begin{document}"]
+    lines = [r"\documentclass{article}", r"\usepackage[T1]{fontenc}", r"\usepackage{booktabs}"]
+    lines += [r"\usepackage[landscape,margin=1cm]{geometry}", r"\begin{document}\scriptsize"]
     for title, tables in sections:
         for table in tables:
             frame = _escaped(table, _latex_text, r"\textbf{{{}}}")
             form = "l" + ("l" if table.prose else "r") * (frame.shape[1] - 1)
-            lines += [r"\begin{table}[p]\centering", rf"\caption{{{_latex_text(f'{table.title}: {title}')}}}"]
-            lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
-            lines += [frame.to_latex(index=False, escape=False, column_format=form) + "}"]
-            lines += [rf"\par\smallskip\footnotesize {_latex_text(table.note)}", r"\end{table}"]
+            caption = _latex_text(f"{table.title}: {title}. {table.note}")
+            options: Any = {"column_format": form, "position": "p", "caption": caption}
+            lines += [frame.to_latex(index=False, escape=False, **options)]
     return "\n".join([*lines, r"\end{document}", ""])
 
 

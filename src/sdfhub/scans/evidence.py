@@ -1,7 +1,7 @@
 """From what was scanned to bounds of signed distances: one observation, whatever the scan was."""
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import igl
 import numpy as np
@@ -22,30 +22,25 @@ QUIETEST, SHARE = 0.3, 0.817  # flattest places, and what they show of the noise
 EDGE = 1.2  # half the edge of the cube in which the outside is flooded, normalised frame
 RAYS = 4  # rays nearest to a place that must all have passed it
 
+Array = np.ndarray | None
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How an observation is made of a scan.
-
-    Source: the jitter of points near the surface is DeepSDF's (its published code).
-    """
+    """How an observation is made of a scan. Source of the jitter near surfaces: DeepSDF's published code."""
 
     rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
     samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
     surface: Share = 0.25  # of them on the surface
-    uniform: Share = 0.15  # of them anywhere in the cube, or in the space a sensor saw to be empty
-    # squared standard deviations of the jitter of the others, normalised units squared
-    variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)
+    uniform: Share = (
+        0.15  # of them, as far as the surface leaves any, in the cube, or where a sensor saw it empty
+    )
+    variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)  # of near ones
     cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
     certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
     background: bool = False  # whether a sensor's rays beside those that met something crossed empty space
     quiet: NonNegativeFloat = 0.003  # noise below this is none: a smooth surface's curvature looks like it
-
-    def __post_init__(self):
-        if self.surface + self.uniform > 1:
-            raise ValueError("surface and uniform must be shares that leave room for each other")
 
     def of_samples(self, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> Observation:
         """From points [N, 3] and their signed distances [N], on both sides: half of the samples inside."""
@@ -55,21 +50,18 @@ class Evidence:
         rows = rng.permutation(rows)
         return Observation.of_samples(points[rows], sdf[rows])
 
-    def of_cloud(
-        self, points: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
-    ) -> Observation:
+    def of_cloud(self, points: np.ndarray, normals: Array, rng: np.random.Generator) -> Observation:
         """From points [M, 3] all over a closed surface, normalised frame, with normals [M, 3] or without.
 
         A place is at most as far as the nearest point, and at least as far as tangent planes there or what
-        the gaps between points leave. With normals the winding number tells its side; without them it is
-        known only where one comes from outside without meeting the
+        the gaps between points leave. Its side: by the winding number with normals, without them by a flood.
         """
-        noise, spacing = self._noise_and_spacing(points)
-        _, uniform, near = self._counts()
+        (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
+        uniform, near = self._counts()
         deviation = np.sqrt(self.variances)[np.arange(near) % len(self.variances), None]
         at = points[rng.integers(len(points), size=near)] + deviation * rng.standard_normal((near, 3))
         at = np.concatenate([at, rng.uniform(-1, 1, (uniform, 3))])
-        distances, nearest = cKDTree(points).query(at, PLANES)
+        distances, nearest = tree.query(at, PLANES)
         distance = distances[:, 0]
         # the nearest of many scattered points lies nearer than the surface
         least = np.sqrt(np.maximum(np.maximum(distance - noise, 0) ** 2 - (GAPS * spacing) ** 2, 0))
@@ -85,19 +77,17 @@ class Evidence:
         low = np.where(outside | unsigned, least, -most)
         return self._with_surface(points, (at, low, np.where(inside, -least, most), unsigned), noise, rng)
 
-    def of_view(
-        self, points: np.ndarray, normals: np.ndarray | None, sensor: np.ndarray, rng: np.random.Generator
-    ) -> Observation:
-        """From points [M, 3] that one sensor at `sensor` [3] saw, with normals [M, 3] or without.
+    def of_view(self, points: np.ndarray, normals: Array, sensor: np.ndarray, rng: Any) -> Observation:
+        """From points [M, 3] that a sensor [3] saw, with normals [M, 3] or without.
 
-        Free space is at least as far from any surface as from space not known to be free, and at most as far
-        as from the nearest seen point. Beside the seen points, the side of the sensor is outside.
+        Free space is at least as far from surfaces as from space not known to be free, and at most as far as
+        from the nearest seen point. Beside seen points, the side of the sensor is outside.
         """
         (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
         beside, steps = self._beside(points, normals, sensor, max(2 * spacing, 3 * noise), tree, rng)
         slack = np.where(steps > 0, noise, np.abs(steps))  # the part may be thin behind its face
         empty, clear = free_space(points, sensor, self.cells, self.background)
-        _, uniform, _ = self._counts()
+        uniform, _ = self._counts()
         rows = rng.integers(len(empty), size=uniform) if len(empty) else np.zeros(0, np.int64)
         at = np.concatenate([beside, empty[rows]])
         low = np.concatenate([steps - slack, clear[rows]])
@@ -119,23 +109,21 @@ class Evidence:
         steps = np.repeat([step, -step], len(flat))
         beside = np.tile(points[flat], (2, 1)) + steps[:, None] * np.tile(normals[flat], (2, 1))
         own = np.flatnonzero(tree.query(beside)[1] == np.tile(flat, 2))
-        own = rng.choice(own, self._counts()[2]) if len(own) else own
+        own = rng.choice(own, self._counts()[1]) if len(own) else own
         return beside[own], steps[own]
 
     def _noise_and_spacing(self, points: np.ndarray) -> tuple[float, float]:
-        """Of points [M, 3], normalised frame; no noise where there is hardly any."""
-        noise = noise_of(points)
-        return (noise if noise > self.quiet else 0.0), spacing_of(points)
+        """Of points [M, 3]; no noise where there is hardly any."""
+        noise, spacing = noise_of(points), float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+        return (noise if noise > self.quiet else 0.0), spacing
 
-    def _counts(self) -> tuple[int, int, int]:
-        """How many rows lie on the surface, anywhere, and near the surface."""
-        surface = round(self.surface * self.rows)
-        uniform = min(round(self.uniform * self.rows), self.rows - surface)
-        return surface, uniform, self.rows - surface - uniform
+    def _counts(self) -> tuple[int, int]:
+        """How many rows lie anywhere, and near the surface."""
+        rest = self.rows - round(self.surface * self.rows)
+        uniform = min(round(self.uniform * self.rows), rest)
+        return uniform, rest - uniform
 
-    def _with_surface(
-        self, points: np.ndarray, bounds: tuple[np.ndarray, ...], noise: float, rng: np.random.Generator
-    ) -> Observation:
+    def _with_surface(self, points, bounds: tuple[np.ndarray, ...], noise: float, rng) -> Observation:
         """Places, their bounds and `unsigned`, and for the rest of the rows surface points; shuffled."""
         surface = points[np.resize(rng.permutation(len(points)), self.rows - len(bounds[0]))]
         zero, order = np.zeros(len(surface)), rng.permutation(self.rows)
@@ -145,16 +133,8 @@ class Evidence:
         return Observation(points, low, high, unsigned, float(noise))
 
 
-def spacing_of(points: np.ndarray) -> float:
-    """Median distance from a point of [N, 3] to its nearest neighbour, in its units."""
-    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
-
-
 def noise_of(points: np.ndarray) -> float:
-    """Standard deviation of points [N, 3] across their surface, in their units.
-
-    How far neighbours scatter about their plane, at the flattest places. Curves look a little noisy.
-    """
+    """Deviation of points [N, 3] across their surface: how they scatter about planes where it is flat."""
     _, scatter = tangent_planes(points[:: max(1, -(-len(points) // ENOUGH))])
     unbiased = np.sqrt(NEIGHBOURS / (NEIGHBOURS - 3))  # a plane takes three numbers
     return float(np.quantile(scatter, QUIETEST) * unbiased / SHARE)
@@ -174,10 +154,9 @@ def grid_of(axis: np.ndarray) -> np.ndarray:
 
 
 def is_outside(points: np.ndarray, at: np.ndarray, reach: float, cells: int) -> np.ndarray:
-    """[Q] whether places `at` [Q, 3] can be reached from afar without coming near a cloud [N, 3].
+    """[Q] whether a flood from afar, in cells^3, comes to places `at` [Q, 3] past a cloud [N, 3].
 
-    A flood fill of the cube [-1.2, 1.2]^3 in cells^3. Near is nearer than `reach`, or than half a cell's
-    diagonal, as thinner walls would let it through.
+    It keeps off by `reach`, and by half a cell's diagonal, as it would leak through thinner walls.
     """
     reach = max(reach, 3**0.5 * EDGE / (cells - 1))
     nodes = grid_of(np.linspace(-EDGE, EDGE, cells))
@@ -197,14 +176,11 @@ def winding(points: np.ndarray, normals: np.ndarray, at: np.ndarray) -> np.ndarr
     return igl.fast_winding_number(*map(np.ascontiguousarray, (points, normals, areas, at)))
 
 
-def free_space(
-    points: np.ndarray, sensor: np.ndarray, cells: int, background: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of [-1, 1]^3 that a sensor [3] whose rays ended at points [N, 3] saw to be empty.
+def free_space(points: np.ndarray, sensor: np.ndarray, cells: int, background: bool) -> tuple[Any, Any]:
+    """Centres [K, 3] of cells that a sensor [3] whose rays ended at points [N, 3] saw to be empty.
 
-    A cell is free if the rays nearest to it, no further apart than rays are from each other, ended a cell
-    behind it; with `background` also where no ray ended near. Its distance to the nearest cell that is not
-    free bounds that to any surface, seen or unseen: centres [K, 3], and lower bounds [K] >= 0 there.
+    The rays nearest to such a cell ended a cell behind it; with `background` also where no ray ended near.
+    Its distance to the nearest cell that is not free bounds that to any surface from below, [K] >= 0.
     """
     size = 2 / cells
     centres = grid_of(-1 + size * (np.arange(cells) + 0.5))

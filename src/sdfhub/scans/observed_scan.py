@@ -15,8 +15,7 @@ from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, Frame, Observation
 
-ScanFrame = Frame | Literal["shape", "unknown"]
-"""How scans lie: in a known frame, as their own bounding box tells, or nobody knows."""
+ScanFrame = Frame | Literal["shape", "unknown"]  # a known one, as the scan's own box tells, or nobody knows
 
 MOST = 2**16  # points of a cloud that are used: a random draw of more
 LARGEST, SMALLEST = 1.2, 0.2  # distance of the farthest point from the origin, normalised frame
@@ -36,17 +35,14 @@ class ObservedScan:
 def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator) -> ObservedScan:
     """What a scan says of the shape behind it.
 
-    A mesh becomes signed samples. Signed samples lie in the normalised frame as they are, unless another
-    known frame is given. A view shows no whole bounding box, so that its frame must be known or unknown.
+    A mesh becomes signed samples; these lie in the normalised frame unless another known one is given.
     """
     if scan.faces is not None:
         return _observe_mesh(scan, scan.faces, evidence, frame, rng)
     if scan.kind == "view" and frame == "shape":
         raise SdfhubError("one view shows no whole box; give frame=normalised, or frame=unknown to find it")
-    if isinstance(frame, Frame):
-        lies = frame
-    else:
-        lies = NORMALIZED if scan.sdf is not None else _box_frame(scan.points)
+    own = None if scan.sdf is None else NORMALIZED
+    lies = frame if isinstance(frame, Frame) else own or _box_frame(scan.points)
     points = lies.to_normalized(scan.points)
     _refuse_misplaced(points, LARGEST if scan.sdf is None else FAR)
     if np.ptp(points, axis=0).max() < SMALLEST:
@@ -67,28 +63,19 @@ def observe(scan: Scan, evidence: Evidence, frame: ScanFrame, rng: np.random.Gen
     return ObservedScan(scan.kind, len(points), observation, lies)
 
 
-def _observe_mesh(
-    scan: Scan, faces: np.ndarray, evidence: Evidence, frame: ScanFrame, rng: np.random.Generator
-) -> ObservedScan:
+def _observe_mesh(scan: Scan, faces, evidence: Evidence, frame: ScanFrame, rng) -> ObservedScan:
     if isinstance(frame, Frame):
         _refuse_misplaced(frame.to_normalized(scan.points), LARGEST)
     preparation = Preparation(samples=max(2 * evidence.samples, 10_000), surface_points=0)
     prepared = prepare_mesh((scan.points, faces), preparation)
     points, sdf, own = prepared.points.astype(np.float64), prepared.sdf.astype(np.float64), prepared.frame
-    if isinstance(frame, Frame):  # as the mesh lies, not as its own box would move it
-        samples = Scan(own.to_source(points), sdf=sdf / own.scale)
-    else:
-        samples, frame = Scan(points, sdf=sdf, frame=own), NORMALIZED
+    frame = frame if isinstance(frame, Frame) else own
+    samples = Scan(own.to_source(points), sdf=sdf / own.scale)
     return replace(observe(samples, evidence, frame, rng), count=len(scan.points))
 
 
-def observations_of(
-    shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]
-) -> list[Observation]:
-    """Signed samples of prepared shapes as observations: so many of each, half of them inside; None for all.
-
-    A shape has a seed of its own, so that its samples do not depend on its neighbours.
-    """
+def observations_of(shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]) -> list:
+    """Observations of so many signed samples of each shape by a seed of its own; None for all samples."""
     observations = []
     for shape, seed in zip(shapes, seeds, strict=True):
         if samples is None:

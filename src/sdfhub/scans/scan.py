@@ -5,6 +5,7 @@ import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,12 +60,11 @@ class Scan:
 
 
 def read_scan(path: str | Path) -> Scan:
-    """The scan in a file; whatever is wrong with one is a line that names it.
+    """The scan in a file.
 
     Meshes as in `read_mesh`; a .ply without faces is a cloud, with normals if its vertices have nx, ny, nz.
     .xyz (text) and .npy: rows x y z or x y z nx ny nz. .npz: `pos` and `neg` are DeepSDF's samples; `points`
-    and `sdf` (and `center`, `scale`) are signed samples; `points`, and `normals` and `sensor` if there, are
-    a cloud.
+    and `sdf` (and `center`, `scale`) are signed samples; `points` (`normals`, `sensor`) are a cloud.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -74,15 +74,18 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: no such file")
     if path.stat().st_size > MAX_BYTES:
         raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
-    readers: dict[str, Callable[[Path], np.ndarray]]
-    readers = {".xyz": np.loadtxt, ".npy": _array_rows, ".ply": _ply_rows}
+    # mapped, a header that claims more than the file fails
+    load_array = partial(np.load, mmap_mode="r", allow_pickle=False)
+    readers: dict[str, Callable] = {".xyz": np.loadtxt, ".npy": load_array, ".ply": _ply_rows}
     try:
         if suffix == ".npz":
             return _archive(path)
-        if suffix in readers and not (suffix == ".ply" and _has_faces(path)):
+        header = path.read_bytes().partition(b"end_header")[0] if suffix == ".ply" else b""
+        has_faces = re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE)
+        if suffix in readers and not has_faces:
             return _cloud(readers[suffix](path))
-        vertices, faces = read_mesh(path)
-        return Scan(vertices, faces=faces)
+        mesh = read_mesh(path)
+        return Scan(mesh[0], faces=mesh[1])
     except RejectedMesh as rejection:
         raise SdfhubError(rejection.detail) from rejection
     except SdfhubError:
@@ -97,15 +100,6 @@ def _cloud(rows: np.ndarray) -> Scan:
         raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
     rows = rows.astype(np.float64)
     return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
-
-
-def _array_rows(path: Path) -> np.ndarray:
-    return np.load(path, mmap_mode="r", allow_pickle=False)  # a header that claims more than the file fails
-
-
-def _has_faces(path: Path) -> bool:
-    header = path.read_bytes().partition(b"end_header")[0]
-    return bool(re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE))
 
 
 def _ply_rows(path: Path) -> np.ndarray:

@@ -18,9 +18,7 @@ from sdfhub.scans.scan import LEAST, Scan
 from sdfhub.shapes import NORMALIZED, NormalizedMesh
 
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)  # told apart, normalised frame
-HALF_VIEW = np.tan(
-    np.radians(24)
-)  # half a picture's width at distance 1: it holds the unit ball from 2.5 away
+HALF_VIEW = np.tan(np.radians(24))  # half a picture's width at distance 1: holds the unit ball from 2.5 away
 DISTANCE, HEIGHT = 2.5, 0.5  # of sensors from the origin, and how far up they may stand, as a sine
 PIXELS = 100
 LOOKS = 20  # places tried for a sensor, until it sees enough points to know a shape
@@ -57,7 +55,7 @@ class ScanKind:
         return observed
 
     def scan(self, shape: StoredShape, number: int = 0) -> Scan:
-        """A simulated scan of a shape, in the normalised frame; another number gives another one."""
+        """A simulated scan of a shape, in the normalised frame, by its number."""
         rng = np.random.default_rng([shape_seed(shape), number])
         if self.kind == "samples":
             rows = np.concatenate([shape.read("outside"), shape.read("inside")]).astype(np.float64)
@@ -94,10 +92,7 @@ def surface_scan(
 def view_scan(
     mesh: NormalizedMesh, sensor: np.ndarray, pixels: int, noise: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """What a sensor [3] outside the unit ball that looks at the origin sees of a mesh: [M, 3] points.
-
-    At most one of each of the picture's pixels * pixels; noise is the standard deviation along the rays.
-    """
+    """Points [M, 3] that a sensor [3] outside the unit ball sees; noise: the deviation along the rays."""
     right = np.cross(-sensor, np.eye(3)[np.abs(sensor).argmin()])
     right /= np.linalg.norm(right)
     _, rays, hits = seen_from(sensor, right, HALF_VIEW, pixels, mesh.vertices, mesh.faces)

@@ -57,14 +57,16 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str],
     if ids is not None:
         train, unseen = [id for id in ids if id in train], [id for id in ids if id not in train]
         if trained_on := seen.intersection(unseen):
-            hint = "leave out data= to judge it as a training shape"
-            raise SdfhubError(f"shapes: {min(trained_on)} was trained on; {hint}")
+            raise SdfhubError(
+                f"shapes: {min(trained_on)} was trained on; leave out data= to judge it as such"
+            )
     elif count is not None:
         unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).held_out]
     elif train:
         unseen = trained["held_out"]
     for id in (*train, *unseen):
         if id not in offered:
-            has = ", ".join(list(offered)[:3])
-            raise SdfhubError(f"shapes: {source.name} has no shape {id!r}; it has {has} ...")
+            raise SdfhubError(
+                f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
+            )
     return Split([offered[id] for id in train], [offered[id] for id in unseen])

@@ -32,8 +32,9 @@ def export(config: DictConfig) -> None:
     path = folder / FILES[to] if to in FILES else Path(to)
     kind = {Path(file).suffix: kind for kind, file in FILES.items()}.get(path.suffix)
     if kind is None:
-        choices = ", ".join([*FILES, "meshes"])
-        raise SdfhubError(f"to={to}: choose {choices}, or a .safetensors, .onnx or .pt2 file")
+        raise SdfhubError(
+            f"to={to}: choose {', '.join(FILES)}, meshes, or a .safetensors, .onnx or .pt2 file"
+        )
     space = load(config.run, device="cpu", trust=config.trust or ())
     if kind != "safetensors":
         write_whole(path, function_file(as_function(space.decoder), kind))
@@ -56,11 +57,8 @@ def export_meshes(config: DictConfig, folder: Path) -> None:
     for id, (vertices, faces) in zip(ids, meshes, strict=True):
         write_mesh(vertices, faces, folder / "meshes" / f"{id}.{suffix}")
         empty += [] if len(faces) else [id]
-    is_known = space.frames.keys() >= set(ids)
-    frame = "their source's frame" if is_known else "the normalised frame: the run does not know its source's"
-    print(f"meshes:    {folder / 'meshes'}: {len(ids) - len(empty)} in {frame}")
-    if empty:
-        print(f"without a surface: {', '.join(empty)}")
+    frame = "their source's frame" if space.frames.keys() >= set(ids) else "the normalised frame"
+    print(f"meshes:    {folder / 'meshes'}: {len(ids)} in {frame}; no surface: {', '.join(empty) or 'none'}")
 
 
 def as_function(decoder: Decoder) -> torch.export.ExportedProgram:
@@ -83,13 +81,13 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
             import onnxscript  # noqa: F401 - PyTorch's exporter is written in it
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
-        names: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
-        program = torch.onnx.export(function, dynamo=True, verbose=False, **names)
+        options: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
+        program = torch.onnx.export(function, dynamo=True, verbose=False, **options)
         assert program
         model = program.model_proto
         values = [*model.graph.input, *model.graph.output, *model.graph.value_info]
         axes = [axis for value in values for axis in value.type.tensor_type.shape.dim]
-        for axis, name in zip([axis.dim_param for axis in axes[:2]], "BN", strict=True):  # of `points`
-            for same in [other for other in axes if other.dim_param == axis]:
-                same.dim_param = name
+        names = {axis.dim_param: name for axis, name in zip(axes[:2], "BN", strict=True)}  # of `points`
+        for axis in [axis for axis in axes if axis.dim_param in names]:
+            axis.dim_param = names[axis.dim_param]
         return model.SerializeToString()

@@ -12,11 +12,11 @@ import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 from omegaconf import DictConfig
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, write_checkpoint
@@ -25,7 +25,7 @@ from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shap
 from sdfhub.data.sources.source import names_listed
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError
-from sdfhub.model.saved import saved_decoder
+from sdfhub.model.saved import PARTS, saved_decoder
 from sdfhub.opening import begin_run, load
 from sdfhub.report.results import first_fault
 
@@ -35,27 +35,17 @@ OWN_KEYS = ("folder", "epoch", "split", "out")  # of the task's config; no part 
 
 
 class NetworkSpecs(BaseModel, extra="forbid"):
-    """`NetworkSpecs` of specs.json: the arguments of DeepSDF's decoder."""
+    """`NetworkSpecs` of specs.json, the arguments of DeepSDF's decoder; its weights show the rest."""
 
     dims: list[int] = Field(min_length=1)
     dropout: list[int] | None = None
     dropout_prob: float = 0.0
     norm_layers: list[int] | None = None
-    latent_in: list[Annotated[int, Field(ge=1)]] = []
+    latent_in: list[int] = []
     weight_norm: bool = False
     xyz_in_all: bool | None = None
     use_tanh: Literal[False] = False  # another tanh before the last one
     latent_dropout: bool = False
-
-    @model_validator(mode="after")
-    def _as_ours(self) -> "NetworkSpecs":
-        if len(set(self.dims)) > 1:
-            raise ValueError("dims: layers of different widths cannot be represented")
-        if self.norm_layers and not self.weight_norm:
-            raise ValueError("norm_layers: LayerNorm (norm_layers without weight_norm) cannot be represented")
-        if max(self.latent_in, default=0) > len(self.dims):
-            raise ValueError(f"latent_in: must name layers 1 to {len(self.dims)}")
-        return self
 
 
 class Specs(BaseModel):
@@ -78,7 +68,14 @@ def import_deepsdf(composed: DictConfig) -> None:
     run = Path(out or Path(config["paths"]["output"]) / "deepsdf" / folder.resolve().name)
     if (run / "config.yaml").exists():
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
-    specs = read_specs(folder / "specs.json")
+    try:
+        specs = Specs.model_validate_json((folder / "specs.json").read_bytes())
+    except OSError as error:
+        raise SdfhubError(
+            f"{folder}: not an experiment of DeepSDF's: specs.json: {error.strerror}"
+        ) from error
+    except ValidationError as error:
+        raise SdfhubError(f"{folder / 'specs.json'}: {first_fault(error)}") from error
     codes = read_codes(folder / "LatentCodes" / f"{epoch}.pth", specs.CodeLength)
     file, node = folder / "ModelParameters" / f"{epoch}.pth", decoder_node(specs)
     weights = decoder_weights(_read(file, "model_state_dict"), node, file)
@@ -90,28 +87,15 @@ def import_deepsdf(composed: DictConfig) -> None:
     samples = samples if samples.name == "SdfSamples" else samples / "SdfSamples"
     frames = {id: frame_of(samples / f"{name}.npz") for id, name in zip(ids, names, strict=True)}
     known = {id: frame for id, frame in frames.items() if frame}
-    for key in OWN_KEYS:
-        del config[key]
-    config["decoder"] = node
+    config = {key: value for key, value in config.items() if key not in OWN_KEYS} | {"decoder": node}
     config["codes"]["max_norm"] = specs.CodeBound
     config["loss"] |= {"delta": specs.ClampingDistance, "lambda_code": specs.CodeRegularizationLambda}
     begin_run(run, config, ids, [], known, DeepSdfSource.up)
     shutil.copyfile(folder / "specs.json", run / "specs.json")
     state = {f"decoder.{name}": weight for name, weight in weights.items()} | {"codes.table": codes}
-    about = {name: config[name] for name in ("decoder", "codes", "loss", "optim", "computing", "seed")}
-    about["shapes"] = len(codes)
+    about = {name: config[name] for name in (*PARTS, "seed") if name in config} | {"shapes": len(codes)}
     write_checkpoint({"state_dict": state, "hyper_parameters": about}, run / "checkpoints" / LAST)
     log.info("run: %s: %d shapes, %d of them with their source's frame", run, len(load(run).ids), len(known))
-
-
-def read_specs(path: Path) -> Specs:
-    """The settings of an experiment; refuses, by the setting, a decoder that ours cannot be."""
-    try:
-        return Specs.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise SdfhubError(f"{path}: not an experiment of DeepSDF's ({error.strerror})") from error
-    except ValidationError as error:
-        raise SdfhubError(f"{path}: {first_fault(error)}") from error
 
 
 def decoder_node(specs: Specs) -> dict[str, Any]:
@@ -133,9 +117,7 @@ def decoder_node(specs: Specs) -> dict[str, Any]:
     }
 
 
-def decoder_weights(
-    parameters: Mapping[str, Tensor], node: Mapping[str, Any], path: Path
-) -> dict[str, Tensor]:
+def decoder_weights(parameters: Mapping[str, Tensor], node: dict[str, Any], path: Path) -> dict[str, Tensor]:
     """DeepSDF's parameters, from `path`, under the names and in the column order of our decoder, `node`."""
     left = {name.removeprefix("module."): tensor.clone() for name, tensor in parameters.items()}
     weights = {}
@@ -143,14 +125,11 @@ def decoder_weights(
         for index in range(node["depth"] + 1):
             weights[f"layers.{index}.linear.bias"] = left.pop(f"lin{index}.bias")
             length = left.pop(f"lin{index}.weight_g", None)
-            if length is None:
-                weight = left.pop(f"lin{index}.weight")
-            else:
-                direction = left.pop(f"lin{index}.weight_v").double()
+            weight = left.pop(f"lin{index}.weight" if length is None else f"lin{index}.weight_v")
+            if length is not None:
+                direction = weight.double()
                 weight = (direction * (length / direction.norm(dim=1, keepdim=True))).float()
-            if (
-                index == 0 or index in node["inject_code"]
-            ):  # [hidden | code | point] to [hidden | point | code]
+            if index in (0, *node["inject_code"]):  # [hidden | code | point] to [hidden | point | code]
                 hidden = weight.shape[1] - 3 - node["code_size"]
                 weight = torch.cat([weight[:, :hidden], weight[:, -3:], weight[:, hidden:-3]], dim=1)
             weights[f"layers.{index}.linear.weight"] = weight
@@ -193,6 +172,7 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
         return [f"shape/{row:05d}" for row in range(count)]
     names = list(names_listed(str(file), "train"))
     if len(names) != count:
-        what = f"lists {len(names)} shapes, but there are codes of {count}"
-        raise SdfhubError(f"{file}: {what}; give the file it was trained with by split=")
+        raise SdfhubError(
+            f"{file}: lists {len(names)} shapes, but there are codes of {count}; give another split="
+        )
     return names

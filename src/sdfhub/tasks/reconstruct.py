@@ -4,6 +4,7 @@ import logging
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,22 +34,17 @@ log = logging.getLogger(__name__)
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     """The files to read, those of a folder included, by the names of their results."""
-    named: dict[Path, str] = {}
+    scans: dict[Path, None] = {}
     for path in map(Path, [wanted] if isinstance(wanted, str) else wanted):
-        inside = [path]
-        if path.is_dir():
-            files = sorted(file for file in path.rglob("*") if file.is_file() and not is_result(file))
-            inside = [file for file in files if file.suffix.lower() in FORMATS]
-            if not inside:
-                raise SdfhubError(f"scans={path}: holds no scans ({' '.join(FORMATS)})")
-            if others := sorted({file.suffix.lower() or file.name for file in set(files) - set(inside)}):
-                log.warning("scans=%s: passes over what is no scan: %s", path, " ".join(others))
-        named |= {file: file.stem for file in inside}
-    if not named:
-        raise SdfhubError("scans: names no scan")
-    count = Counter(named.values())
-    names = {path: stem if count[stem] == 1 else path.name.replace(".", "-") for path, stem in named.items()}
-    return unique_ids(names)
+        inside = sorted(file for file in path.rglob("*") if file.is_file() and not is_result(file))
+        if others := {file.suffix.lower() or file.name for file in inside}.difference(FORMATS):
+            log.warning("scans=%s: passes over what is no scan: %s", path, " ".join(sorted(others)))
+        scans |= dict.fromkeys(file for file in inside if file.suffix.lower() in FORMATS)
+        scans |= {} if path.is_dir() else {path: None}
+    if not scans:
+        raise SdfhubError(f"scans={wanted}: holds no scans ({' '.join(FORMATS)})")
+    count = Counter(path.stem for path in scans)
+    return unique_ids({p: p.stem if count[p.stem] == 1 else p.name.replace(".", "-") for p in scans})
 
 
 def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]:
@@ -88,29 +84,23 @@ def unseen_shapes(run: Path, config: DictConfig, count: int) -> list[StoredShape
     """Up to `count` shapes that a run was not trained on: its held-out ones, then others of its source."""
     data, roles = data_again(run, config)[1:]
     offered = {shape.id: shape for shape in data.source.shapes()}
-    first = [offered[id] for id in roles["held_out"] if id in offered][:count]
-    used = {*roles["train"], *roles["held_out"]}
-    rest = [shape for id, shape in offered.items() if id not in used and shape.split != "train"]
-    rest = [shape for shape in rest if shape.split == "held_out"] or rest
+    first = [offered.pop(id) for id in roles["held_out"] if id in offered]
+    rest = [s for id, s in offered.items() if id not in roles["train"] and s.split != "train"]
+    rest, first = [shape for shape in rest if shape.split == "held_out"] or rest, first[:count]
     more = split(rest, 0, min(count - len(first), len(rest)), seed=0).held_out
     return list(data.filled(Split([], first + more)).values())
 
 
 def limits_of(
-    run: Path,
-    reconstructor: Reconstructor,
-    calibration: Calibration,
-    kinds: Sequence[ScanKind],
-    config: DictConfig,
+    run: Path, scans: Reconstructor, calibration: Calibration, kinds: Sequence[ScanKind], config: DictConfig
 ) -> dict[ScanKind, Limits]:
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     if not calibration.shapes:
         return {}
     settings: dict[str, Any] = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
-    settings["poses"] = plain(config.poses) if reconstructor.poses else None
-    unseen = lambda count: unseen_shapes(run, config, count)  # noqa: E731
+    settings["poses"] = plain(config.poses) if scans.poses else None
     try:
-        return calibration.limits(run, settings, kinds, reconstructor, unseen)
+        return calibration.limits(run, settings, kinds, scans, partial(unseen_shapes, run, config))
     except (SdfhubError, OSError, LookupError, TypeError) as error:  # an older run may lack anything
         log.warning("no verdicts: %s", error)
         return {}
@@ -126,9 +116,7 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
     for name, path in files.items():
         mesh = out / f"{name}.ply"
         if mesh.resolve() == path.resolve() or (mesh.exists() and not is_result(mesh)):
-            raise SdfhubError(
-                f"out={out}: the result of {path} would overwrite {mesh}; choose another folder"
-            )
+            raise SdfhubError(f"out={out}: the result of {path} would overwrite {mesh}")
     reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
     scans: dict[str, ObservedScan] = {}

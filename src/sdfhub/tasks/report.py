@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import re
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,19 +79,16 @@ def write_sheet(sheet: Sheet, path: Path) -> None:
 
 def truth_finder() -> FindTruth:
     """Finds prepared shapes in the store that a cell was trained from, where that is here."""
-    stores: dict[str, Store | None] = {}
+    stores: dict[Path, Store] = {}
 
     def find(cell: Cell, id: str) -> StoredShape | None:
-        key = str(cell.scores.config.get("data"))
-        if key not in stores:
-            try:
+        with suppress(SdfhubError, KeyError, TypeError, AttributeError):  # not on this machine, or no config
+            if cell.folder not in stores:
                 data = data_of(cell.scores.config)
                 folder = Path(data.store) / data.source.name / preparation_hash(data.preparation)
-                stores[key] = Store.open(folder, up=data.source.up)
-            except (SdfhubError, KeyError, TypeError, AttributeError):
-                stores[key] = None  # not on this machine: a report without ground truth
-        store = stores[key]
-        return store.get(id) if store else None
+                stores[cell.folder] = Store.open(folder, up=data.source.up)
+            return stores[cell.folder].get(id)
+        return None
 
     return find
 

@@ -31,9 +31,10 @@ from sdfhub.evaluation.judging import Evaluation, evaluate_model
 from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
-from sdfhub.multirun.cells import go_on, run_cell
 from sdfhub.multirun.search import objective
+from sdfhub.multirun.sweep import go_on, run_cell
 from sdfhub.opening import begin_run, read_run
+from sdfhub.report.results import ROLES
 from sdfhub.settings import WHERE_NOT_WHAT, flat
 
 log = logging.getLogger(__name__)
@@ -95,14 +96,10 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
         if not isinstance(logger, TensorBoardLogger):  # takes settings once, with the scores
             logger.log_hyperparams(flat(written))
     fit(model, parts, config.ckpt_path)
-    if not trainer.is_global_zero:
+    if not trainer.is_global_zero or getattr(trainer, "fast_dev_run", False):  # which keeps nothing
         return {}
-    if getattr(trainer, "fast_dev_run", False):
-        log.info("trainer.fast_dev_run: every part has run once; nothing is kept or judged")
-        return {}
-    checkpoint = folder / "checkpoints" / LAST
-    if not checkpoint.exists():  # callbacks without one of checkpoints
-        trainer.save_checkpoint(checkpoint)
+    if not (folder / "checkpoints" / LAST).exists():  # callbacks without one of checkpoints
+        trainer.save_checkpoint(folder / "checkpoints" / LAST)
     metrics = judge(model, parts, folder)
     log_scores(trainer, written, metrics)
     return metrics
@@ -144,15 +141,14 @@ def make_optimisation(config: DictConfig) -> Optimisation:
     return Optimisation.of(instantiate(config, "optim"))
 
 
-def make_trainer(
-    config: DictConfig, folder: Path, callbacks: list[Callback], loggers: list[Logger]
-) -> Trainer:
+def make_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], loggers: list[Any]) -> Trainer:
     """Lightning's trainer; what the config says of callbacks, loggers and plugins goes before ours."""
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
-        hint = "shapes are meshed with all weights on each device; use ddp"
-        raise SdfhubError(f"trainer.strategy={config.strategy}: {hint}")
+        raise SdfhubError(
+            f"trainer.strategy={config.strategy}: meshing needs a whole model a device; use ddp"
+        )
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
@@ -172,18 +168,17 @@ def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
     try:
         parts.trainer.fit(model, datamodule=parts.data, ckpt_path=checkpoint, weights_only=True)
     except torch.OutOfMemoryError as error:
-        raise SdfhubError(
-            "the GPU's memory is full: lower computing.points_at_once (262144 by default); "
-            "data.loader.resident=false leaves the samples on the disk"
-        ) from error
+        hint = "lower computing.points_at_once, or leave samples on the disk: data.loader.resident=false"
+        raise SdfhubError(f"the GPU's memory is full: {hint}") from error
     except SIGTERMException as stop:
         raise SystemExit(143) from stop  # Lightning's has status 0
     except RuntimeError as error:  # gloo raises it bare, NCCL a kind of it
         is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
-        if parts.trainer.world_size > 1 and is_loss:
-            lost = "another process of this run has died; continue from its last checkpoint"
-            raise SdfhubError(lost) from error
-        raise
+        if parts.trainer.world_size == 1 or not is_loss:
+            raise
+        raise SdfhubError(
+            "another process of this run has died; continue from its last checkpoint"
+        ) from error
 
 
 def refuse_processes_in_multirun(trainer: Trainer) -> None:
@@ -191,8 +186,7 @@ def refuse_processes_in_multirun(trainer: Trainer) -> None:
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     starts = trainer.world_size > 1 and not (cluster and cluster.creates_processes_externally)
     if starts and HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
-        hint = "a cell of a multirun has one device, or processes of SLURM; set 1"
-        raise SdfhubError(f"trainer.devices: {hint}")
+        raise SdfhubError("trainer.devices: a cell of a multirun has one device, or processes of SLURM")
 
 
 def refuse_other_settings(checkpoint: Path, config: dict[str, Any]) -> None:
@@ -211,19 +205,15 @@ def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
     """Refuses to continue a checkpoint where data= now offers other shapes: a code is known by its row."""
     folder = checkpoint.parent.parent
     then = read_run(folder)[1]["train"] if (folder / "split.json").is_file() else ids
-    for row, (before, now) in enumerate(zip_longest(then, ids, fillvalue="none")):
+    for row, (before, now) in enumerate(zip_longest(then, ids)):
         if before != now:
-            raise SdfhubError(
-                f"ckpt_path={checkpoint}: the shapes that data= offers have changed: code {row} is that of "
-                f"{before}, now it would be that of {now}; bring them back, or train anew"
-            )
+            what = f"code {row} is that of {before}, now it would be that of {now}"
+            raise SdfhubError(f"ckpt_path={checkpoint}: the shapes that data= offers have changed: {what}")
 
 
 def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
     """What `metrics.json` holds: the training's cost and the scores of training and held-out shapes."""
     training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
-    if not parts.record.stepped:
-        log.info("the training was finished before (trainer.max_epochs would prolong it); judging")
     model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
     train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
     codes, delta = model.codes.table.detach(), model.loss.delta
@@ -233,13 +223,11 @@ def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
 def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:
     """Mean and median CD x 10^3 and shapes without a surface by role, at the last step, as `final/...`."""
     scores: dict[str, float] = {}
-    for role in ("train", "held_out"):
-        summary = metrics.get(role, {}).get("summary", {})
-        for name in ("mean", "median"):
-            if (value := summary.get("cd", {}).get(name)) is not None:
-                scores[f"final/{role}_cd_{name}"] = value * 1e3
-        if "failed" in summary:
-            scores[f"final/{role}_failed"] = summary["failed"]
+    for role in filter(metrics.get, ROLES):
+        summary = flat(metrics[role]["summary"])
+        scores |= {f"final/{role}_failed": summary["failed"]} if "failed" in summary else {}
+        values = {name: summary.get(f"cd.{name}") for name in ("mean", "median")}
+        scores |= {f"final/{role}_cd_{k}": 1e3 * cd for k, cd in values.items() if cd is not None}
     for logger in trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
             logger.log_hyperparams(flat(config), scores, step=trainer.global_step)

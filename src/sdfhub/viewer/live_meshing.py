@@ -3,9 +3,9 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import CancelledError
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -15,8 +15,7 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances
 
 
-@dataclass(frozen=True, eq=False)
-class Meshed:
+class Meshed(NamedTuple):
     """A mesh in the normalised frame of a code that was asked for, empty without a surface, `seconds` ago."""
 
     about: Any  # what was handed over with the code
@@ -26,18 +25,16 @@ class Meshed:
 
 
 class LiveMesher:
-    """A thread that meshes the latest code on grids of rising `resolutions` and calls `show` with each mesh.
+    """A thread that meshes the latest code on grids of rising `resolutions`: `show` gets each, or an error.
 
     The first resolution is always finished, so that something moves while codes come faster than meshes; a
-    finer one is given up as soon as another code is asked for. `show` also gets the reason of a failure.
+    finer one is given up as soon as another code is asked for.
     """
 
-    def __init__(
-        self, decoder: Decoder, resolutions: Sequence[int], show: Callable[[Meshed | SdfhubError], None]
-    ):
+    def __init__(self, decoder: Decoder, resolutions: Sequence[int], show: Callable[[Any], None]):
         self.decoder, self.resolutions, self.show = decoder, tuple(resolutions), show
         self._requests: SimpleQueue[tuple[Tensor, Any, float] | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="mesher", daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def ask(self, code: Tensor, about: Any = None) -> None:
@@ -55,23 +52,18 @@ class LiveMesher:
                 continue
             try:
                 self._refine(*request)
-            except _Outdated:
+            except CancelledError:
                 pass
             except Exception as error:  # such as no memory left: the page must hear of it, and go on
-                reason = f"{type(error).__name__}: {error}"
-                self.show(error if isinstance(error, SdfhubError) else SdfhubError(reason))
+                self.show(error if isinstance(error, SdfhubError) else SdfhubError(repr(error)))
 
     def _refine(self, code: Tensor, about: Any, asked: float) -> None:
         for index, resolution in enumerate(self.resolutions):
 
             def fields(points: Tensor, shapes: Tensor, is_first: bool = index == 0) -> Tensor:
                 if not (is_first or self._requests.empty()):
-                    raise _Outdated
+                    raise CancelledError
                 return distances(self.decoder, points, code[None].expand(len(shapes), -1))
 
             mesh = next(mesh_fields(fields, 1, resolution, device=code.device))
             self.show(Meshed(about, mesh, resolution, time.perf_counter() - asked))
-
-
-class _Outdated(Exception):
-    """Another code was asked for."""

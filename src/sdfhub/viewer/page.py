@@ -15,7 +15,7 @@ from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.geometry.up_axis import turned_up
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
-from sdfhub.scans.scan import Scan, read_scan
+from sdfhub.scans.scan import read_scan
 from sdfhub.space import Space
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
@@ -85,32 +85,30 @@ class Viewer:
 
     def fit(self, name: str, content: bytes) -> None:
         """Fits a scan, offers it beside the shapes and shows it; says why where that fails."""
-        name = shown_name(name)
-        if not self._fitting.acquire(blocking=False):
-            return self._show_message("One scan at a time: another is being fitted.")
+        last = PurePath(name.replace("\\", "/")).name or "scan"
+        name = "".join(letter for letter in last if letter.isprintable())[-60:]
         try:
             if not content:  # what the gate cut off arrives so
                 raise SdfhubError(f"{name}: empty, larger than {MAX_UPLOAD >> 20} MiB or of another type")
-            self._show_message(f"Fitting {name} …")
-            code, surface = fit_scan(self.space, name, content)
-            self._show_message(f"{name}: {self._quality(code, surface)}")
-            self.name.content = paragraph(name, "name") + paragraph("meshing …", "small")
-            self.shapes[name], self.scans[name] = code, surface
-            self.a.options = self.b.options = tuple(self.shapes)
-            self.a.value = name
-            self.reset()
+            self.message.content = paragraph(f"Fitting {name} …", "small")
+            with self._fitting:
+                code, surface = fit_scan(self.space, name, content)
+                self.message.content = paragraph(f"{name}: {self._quality(code, surface)}", "small")
+                self.shapes[name], self.scans[name] = code, surface
+                self.a.options = self.b.options = tuple(self.shapes)
+                self.a.value = name
+                self.reset()
         except SdfhubError as error:
-            self._show_message(str(error), "wrong")
-        finally:
-            self._fitting.release()
+            self.message.content = paragraph(str(error), "wrong")
 
     def _quality(self, code: Tensor, surface: np.ndarray) -> str:
         """How well a code fits the points of a scan's surface, and whether it is one of this space."""
         with torch.no_grad():
             distance = float(self.space.sdf(surface, code).abs().mean())
         is_strange = self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max()
-        strange = " Doubtful: its code is unlike those of this space's shapes." if is_strange else ""
-        doubt = " Doubtful: that is far." if distance > FAR else strange
+        doubt = (
+            " Doubtful: far, or a code unlike those of this space." if distance > FAR or is_strange else ""
+        )
         return f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2.{doubt}"
 
     def _draw(self, meshed: Meshed | SdfhubError) -> None:
@@ -126,9 +124,6 @@ class Viewer:
                 text = paragraph(size if len(faces) else "no surface", "small")
                 self.name.content = paragraph(meshed.about, "name") + text
         self.drawn.set()
-
-    def _show_message(self, text: str, kind: str = "small") -> None:
-        self.message.content = paragraph(text, kind)
 
     def _add_scene(self) -> None:
         scene, up = self.server.scene, self.space.up
@@ -185,25 +180,16 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
         except (SdfhubError, ValueError) as error:
             reason = str(error).replace(str(path), name)
             raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
-    return code, observed.frame.to_normalized(surface_points(scan, rng)).astype(np.float32)
-
-
-def surface_points(scan: Scan, rng: np.random.Generator) -> np.ndarray:
-    """At most POINTS points [M, 3] of a scan's surface, in its frame."""
     if scan.faces is None:
-        return scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    return sample_surface(scan.points, scan.faces, POINTS, rng)[0]
+        surface = scan.points[rng.permutation(len(scan.points))[:POINTS]]
+    else:
+        surface = sample_surface(scan.points, scan.faces, POINTS, rng)[0]
+    return code, observed.frame.to_normalized(surface).astype(np.float32)
 
 
 def bounded(value: float, low: float, high: float) -> float:
     """What a page sent, if it is a number that its slider can have; else 0."""
     return value if low <= value <= high else 0.0
-
-
-def shown_name(name: str) -> str:
-    """A file's name as it may be shown: no folders, nothing unprintable, not long."""
-    last = PurePath(name.replace("\\", "/")).name or "scan"
-    return "".join(letter for letter in last if letter.isprintable())[-60:]
 
 
 def paragraph(text: str, kind: str) -> str:

@@ -1,9 +1,9 @@
-"""Backs of sofas: stuffed walls of many fronts, loose cushions, and the Chesterfield's running roll."""
+"""What is stuffed of a sofa: its back of many fronts, seat cushions, throw pillows, bolsters."""
 
 import numpy as np
 from manifold3d import Manifold
 
-from sdfhub.procedural import parts, sofa_cushions
+from sdfhub.procedural import parts
 
 
 def back(sofa) -> list[Manifold]:
@@ -48,7 +48,7 @@ def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Mani
         t, z = np.concatenate([t, back_t]), np.concatenate([z, back_z])
         y = sofa.seat_depth / 2 + t + _lean(sofa, z)
         sections.append(np.column_stack([np.full(len(z), s), y, z]))
-    return parts.loft(np.array(sections))
+    return parts.loft(sections)
 
 
 def _level(sofa, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -101,29 +101,101 @@ def _cushions(sofa) -> list[Manifold]:
     low, high = sofa.seat_height - 0.03, sofa.seat_height + sofa.back_height + 0.03
     middle = (low + high) / 2
     y = sofa.seat_depth / 2 + _lean(sofa, middle) - 0.5 * thick + 0.8 * r
-    for left, right in sofa_cushions.spans(sofa, sofa.seats):
+    for left, right in spans(sofa, sofa.seats):
         # built lying down, then stood up: its crown faces the sitter
         size, centre = (right - left, high - low, thick), ((left + right) / 2, y, middle)
-        made.append(sofa_cushions.cushion(size, centre, 1.1 * r, sofa.crown + 0.012, lean=90.0 - angle))
+        made.append(cushion(size, centre, 1.1 * r, sofa.crown + 0.012, lean=90.0 - angle))
     return made
 
 
 def _chesterfield(sofa) -> list[Manifold]:
     """Arms and back of one height: an upright and a roll along its top, round the corners."""
-    thick, radius = upright(sofa), 0.4 * sofa.arm_width + 0.03
+    thick, radius = sofa.wall, 0.4 * sofa.arm_width + 0.03
     x, rear = sofa.half_seat + thick / 2, sofa.rear - thick / 2
     axis, low = sofa.seat_height + sofa.arm_height + 0.1 - radius, sofa.leg_height
     plan = [(-x, sofa.front, 0), (-x, rear, 0), (x, rear, 0), (x, sofa.front, 0)]
-    path = parts.filleted(plan, corner(sofa), 8) + [0, 0, axis]
+    path = parts.filleted(plan, sofa.bend, 8) + [0, 0, axis]
     section = np.array([(-thick / 2, low - axis), (thick / 2, low - axis), (thick / 2, 0), (-thick / 2, 0)])
     return [parts.sweep(path, section), parts.tube(path, radius, 24)]
 
 
-def upright(sofa) -> float:
-    """Thickness of the Chesterfield's wall."""
-    return 0.8 * sofa.arm_width
+def cushion(size, centre, radius: float, crown: float, lean: float = 0.0, steps: int = 3) -> Manifold:
+    """A rounded box whose +z side swells, `crown` above its rim in the middle, leant by degrees around x."""
+    block = parts.rounded_box(size, (0, 0, 0), radius, steps)
+    u, v = (g.ravel() for g in np.meshgrid(*2 * [np.linspace(-0.94, 0.94, 7)], indexing="ij"))
+    inner = np.asarray(size) / 2 - [0.6 * radius, 0.6 * radius, 0]
+    swell = inner[2] + crown * ((1 - u**2) * (1 - v**2)) ** 0.6
+    points = np.column_stack([u * inner[0], v * inner[1], swell])
+    rim = block.to_mesh64().vert_properties[:, :3]
+    solid = Manifold.hull_points(np.ascontiguousarray(np.vstack([rim, points])))
+    return solid.rotate((lean, 0, 0)).translate(centre)
 
 
-def corner(sofa) -> float:
-    """How far from its corners the Chesterfield's wall begins to turn."""
-    return 0.14 + 0.5 * sofa.hump
+def spans(sofa, count: int) -> list[tuple[float, float]]:
+    """Left and right ends of `count` cushions side by side; the outer ones run into the arms."""
+    edges = np.linspace(-sofa.half_seat, sofa.half_seat, count + 1)
+    left, right = edges[:-1] + sofa.gap / 2, edges[1:] - sofa.gap / 2
+    reach = -0.004 if sofa.armless else 0.014
+    left[0], right[-1] = edges[0] - reach, edges[-1] + reach
+    return list(zip(left, right, strict=True))
+
+
+def seats(sofa) -> list[Manifold]:
+    """The cushions one sits on, sunk into the deck by their rounding so that nothing is hollow below them."""
+    placed = [(a, b, sofa.front) for a, b in spans(sofa, 1 if sofa.seat == "bench" else sofa.seats)]
+    if sofa.chaise_span:
+        left, right = sofa.chaise_span
+        if sofa.seat == "bench" or right - left > 1.01 * 2 * sofa.half_seat / sofa.seats:
+            placed.append((left, right, sofa.chaise_front))
+        else:
+            at = 0 if sofa.chaise == "left" else -1
+            placed[at] = (*placed[at][:2], sofa.chaise_front)
+    made, rear = [], sofa.back_face + sofa.cushion_radius + 0.012
+    low = sofa.deck - 0.6 * sofa.cushion_radius
+    for left, right, front in placed:
+        size = (right - left, rear - front, sofa.seat_height - low)
+        centre = ((left + right) / 2, (front + rear) / 2, (low + sofa.seat_height) / 2)
+        made.append(cushion(size, centre, sofa.cushion_radius, sofa.crown))
+    return made
+
+
+def loose(sofa) -> list[Manifold]:
+    """Throw pillows that lean on the back, or a bolster along each arm."""
+    if sofa.pillows == "none":
+        return []
+    back = sofa.back_face - (0.5 * sofa.back_thickness if sofa.back == "cushions" else 0.0)
+    if sofa.pillows == "bolsters":
+        return _bolsters(sofa, back)
+    size = sofa.pillow_size
+    x, z = sofa.half_seat - 0.55 * size - 0.02, sofa.seat_height + 0.42 * size
+    if sofa.seats == 1:
+        return [_pillow(size, (0, back - 0.1, z), 0.0)]
+    first = _pillow(size, (x, back - 0.12, z), -18.0)
+    if sofa.pillows == "one":
+        return [first]
+    return [first, _pillow(0.92 * size, (-x, back - 0.12, z - 0.02), 14.0)]
+
+
+def _bolsters(sofa, back: float) -> list[Manifold]:
+    r, length = 0.24 * sofa.pillow_size, min(1.15 * sofa.pillow_size, back - sofa.front - 0.06)
+    profile = [(0.3, 0), (0.82, 0.008), (0.95, 0.04), (1, 0.1)]
+    profile += [(1, 0.9), (0.95, 0.96), (0.82, 0.992), (0.3, 1)]
+    x, z = sofa.half_seat - 0.92 * r, sofa.seat_height + 0.88 * r + 0.3 * sofa.crown
+    start, end = (x, back + 0.02 - length, z), (x, back + 0.02, z)
+    return parts.mirrored(parts.turned(start, end, parts.scaled(profile, r)))
+
+
+def _pillow(size: float, centre, yaw: float) -> Manifold:
+    """A square pillow, thick in its middle, with drawn-in sides and pointed corners."""
+    t = np.sin(np.linspace(-1, 1, 15) * np.pi / 2)
+    around = np.concatenate([t, t[::-1]])
+    side = np.repeat([1.0, -1.0], len(t))
+    sections = []
+    for u in t:
+        height = 0.5 * size * (0.92 + 0.08 * u**4) * around
+        swell = ((1 - u**2) * (1 - around**2)) ** 0.45
+        thick = side * (0.016 + 0.17 * size * swell)
+        across = 0.5 * size * u * (0.92 + 0.08 * around**4)
+        sections.append(np.column_stack([across, thick, height]))
+    leaning = parts.loft(sections).rotate((-17, 0, 0)).rotate((0, 0, yaw))
+    return leaning.translate(centre)
