@@ -49,7 +49,7 @@ def judged(cell: Cell, score: ShapeScore, truth) -> tuple | None:
     mesh = reconstruction(cell.folder, "train", score, shape) if shape else None
     if mesh is None:
         return None
-    surface = np.array(shape.surface[:POINTS, :3])
+    surface = np.array(shape.read("surface")[:POINTS, :3])
     tree = cKDTree(surface)
     mirrors = [surface * np.where(np.arange(3) == axis, -1, 1) for axis in (0, 1 if shape.up == "z" else 2)]
     asymmetries = [2e3 * (tree.query(mirror)[0] ** 2).mean() for mirror in mirrors]  # both ways alike

@@ -56,7 +56,7 @@ def rivals(args: argparse.Namespace, folder: Path) -> dict[str, object]:
     shapes = [RandomShape.drawn(seed) for seed in range(args.shapes)]
     files = [folder / f"{index}.npz" for index in range(args.shapes)]
     for file, shape in zip(files, shapes, strict=True):
-        np.savez(file, pos=shape.outside, neg=shape.inside)
+        np.savez(file, pos=shape.read("outside"), neg=shape.read("inside"))
     device, surface = torch.device(args.device), args.samples // 4  # as at scale=paper
     large = ["decoder=paper_585k", *args.overrides]
     paper = ["encoding=fourier", "encoding.frequencies=12", *large]

@@ -215,7 +215,7 @@ def test_the_observation_of_a_stored_shape_is_the_same_in_any_company():
     assert all(observation.is_exact for observation in both)
     assert np.array_equal(both[1].points, alone.points) and (alone.low < 0).sum() == 100
     (whole,) = observations_of(shapes[:1], None, [0])
-    assert len(whole.points) == len(shapes[0].outside) + len(shapes[0].inside)
+    assert len(whole.points) == len(shapes[0].read("outside")) + len(shapes[0].read("inside"))
 
 
 @pytest.mark.parametrize(

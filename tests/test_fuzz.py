@@ -6,7 +6,6 @@ time; what it finds becomes an `example` here or a test of its own.
 
 import io
 import json
-import lzma
 import os
 import tarfile
 import zipfile
@@ -31,7 +30,7 @@ from sdfhub.errors import SdfhubError
 from sdfhub.opening import read_run
 from sdfhub.report.results import read_sweep
 from tests.test_mesh_files import AC3D
-from tests.test_open_data import deb
+from tests.test_open_data import deb, deb_of, needs_dpkg
 from tests.test_store import Balls, fill
 from tests.tiny import read_weights
 
@@ -162,7 +161,7 @@ def test_furniture_libraries():
 
     def read(path: Path):
         for member, _ in furniture_in(path):
-            triangles_of(read_model(path, member), ".obj", member)
+            read_model(path, member)
 
     check_file(packed.getvalue(), read, "a.sh3f")
 
@@ -260,8 +259,8 @@ def test_sweeps(name, tmp_path):
     check()
 
 
-def test_debian_packages(tmp_path, monkeypatch):
-    monkeypatch.setattr(fetch.shutil, "which", lambda name: None)
+@needs_dpkg
+def test_debian_packages(tmp_path):
     content = deb(tmp_path / "a.deb", {"./usr/x/a.sh3f": b"A" * 50, "../b.sh3f": b"B"}).read_bytes()
 
     def read(path: Path):
@@ -272,8 +271,8 @@ def test_debian_packages(tmp_path, monkeypatch):
     check_file(content, read, "a.deb")
 
 
-def test_archives_within_debian_packages(tmp_path, monkeypatch):
-    monkeypatch.setattr(fetch.shutil, "which", lambda name: None)
+@needs_dpkg
+def test_archives_within_debian_packages():
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as tar:
         for name in ("./usr/x/a.sh3f", "copyright"):
@@ -282,10 +281,6 @@ def test_archives_within_debian_packages(tmp_path, monkeypatch):
             tar.addfile(info, io.BytesIO(b"x" * 30))
 
     def read(path: Path):
-        data = lzma.compress(path.read_bytes())
-        header = f"{'data.tar.xz':<16}{0:<12}{0:<6}{0:<6}{100644:<8}{len(data):<10}`\n".encode()
-        whole = path.with_suffix(".deb")
-        whole.write_bytes(b"!<arch>\n" + header + data)
-        fetch.unpack(whole, path.parent / "out", ".sh3f")
+        fetch.unpack(deb_of(path.with_suffix(".deb"), path.read_bytes()), path.parent / "out", ".sh3f")
 
     check_file(packed.getvalue()[:2048], read, "a.tar")

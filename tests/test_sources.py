@@ -284,7 +284,8 @@ def test_deepsdf_samples_go_into_the_store(tmp_path):
     source = DeepSdfSource(str(tmp_path / "npz"))
     stored = prepare(source, source.shapes(), Preparation(), tmp_path / "store", workers=1)
     shape = stored["folder/a"]
-    assert (len(shape.outside), len(shape.inside), len(shape.surface)) == (100, 40, 0) and shape.mesh is None
+    assert [len(shape.read(name)) for name in ("outside", "inside", "surface")] == [100, 40, 0]
+    assert shape.mesh is None
 
 
 def test_meshes_of_a_folder_go_into_the_store(tmp_path):
@@ -294,7 +295,7 @@ def test_meshes_of_a_folder_go_into_the_store(tmp_path):
     settings = Preparation(samples=2000, surface_points=100)
     stored = prepare(source, source.shapes(), settings, tmp_path / "store", workers=1)
     assert list(stored) == ["folder/ball"] and stored.rejected["folder/broken"].reason == "no_faces"
-    rows = np.concatenate([stored["folder/ball"].outside, stored["folder/ball"].inside])
+    rows = np.concatenate([stored["folder/ball"].read("outside"), stored["folder/ball"].read("inside")])
     assert len(rows) == 2000
     radius = np.linalg.norm(rows[:, :3], axis=1)
     assert np.abs(rows[:, 3] - (radius - 1 / 1.03)).max() < 0.02  # the ball has flat faces

@@ -130,7 +130,7 @@ def test_a_file_that_changes_while_it_is_used_is_named(damage, tmp_path):
     elif damage == "link":
         (tmp_path / "other").write_bytes(whole)
         shape.path.symlink_to(tmp_path / "other")
-    for use in (lambda: shape.read("outside", 0, 5), lambda: shape.inside):
+    for use in (lambda: shape.read("outside", 0, 5), lambda: shape.read("inside")):
         with pytest.raises(SdfhubError, match=r"balls/0000\.safetensors: .*; start or prepare again"):
             use()
     assert not shape.is_intact() or damage == "cut"
@@ -262,4 +262,4 @@ def test_files_are_compared_again_only_when_their_date_or_size_has_changed(tmp_p
 
 def test_an_array_that_is_read_wraps_around(tmp_path):
     shape = fill(tmp_path, Balls(1))["balls/0000"]
-    assert np.array_equal(shape.read("outside", shape.rows("outside") - 1, 2)[1], shape.outside[0])
+    assert np.array_equal(shape.read("outside", shape.rows("outside") - 1, 2)[1], shape.read("outside")[0])

@@ -7,11 +7,10 @@ import os
 import signal
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, as_completed
-from contextlib import contextmanager, suppress
-from itertools import chain
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
+from itertools import islice
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -26,54 +25,45 @@ class Crashed:
     """The result of an item whose worker process died (out of memory, a fault in a native library)."""
 
 
-def map_in_processes(function: Callable, items: list, workers: int) -> Iterator[tuple[int, Any]]:
+def map_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[tuple[int, Any]]:
     """(index, function(item)) of each item, in the order in which they end; `Crashed` where a worker died.
 
-    Function and items are picklable; exceptions are raised here. A worker has one thread.
+    Function and items are picklable; exceptions are raised here. A worker has one thread. Items are taken
+    while the workers compute, at most two a worker ahead.
     """
+    numbered, waiting = enumerate(items), dict[int, Any]()
     if workers < 2:
-        yield from enumerate(map(function, items))
+        yield from ((index, function(item)) for index, item in numbered)
         return
-    left = dict(enumerate(items))
-    while left:
+    while True:
         try:
-            for index, result in _in_pool(function, left, workers):
-                del left[index]
-                yield index, result
-        except BrokenProcessPool:
-            # The item that killed its worker was among the first of those left: try these one at a time.
-            for index in list(left)[: 2 * workers]:
+            yield from _in_pool(function, numbered, waiting, workers)
+            return
+        except BrokenProcessPool:  # the item that killed its worker is one of those waiting: one at a time
+            for index, item in waiting.items():
                 try:
-                    yield from _in_pool(function, {index: left.pop(index)}, 1)
+                    yield from _in_pool(function, iter([(index, item)]), {}, 1)
                 except BrokenProcessPool:
                     yield index, Crashed()
+            waiting = {}
 
 
-def stream_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[Any]:
-    """function(item) of each item, in their order, computed while the caller makes the next items.
-
-    At most two items a worker wait. Where a worker dies, what is left is computed here, as with fewer than
-    two workers. Otherwise as `map_in_processes`.
-    """
-    items, left, futures = iter(items), deque[Any](), deque[Future]()
-    if workers >= 2:
-        with suppress(BrokenProcessPool), _pool(function, workers) as pool:
-            for item in items:
-                left.append(item)
-                futures.append(pool.submit(_call, item))
-                if len(left) > 2 * workers:
-                    yield futures.popleft().result()
-                    left.popleft()
-            while futures:
-                yield futures.popleft().result()
-                left.popleft()
-    yield from map(function, chain(left, items))
-
-
-def _in_pool(function: Callable, items: dict[int, Any], workers: int) -> Iterator[tuple[int, Any]]:
+def _in_pool(
+    function: Callable, items: Iterator[tuple[int, Any]], waiting: dict[int, Any], workers: int
+) -> Iterator[tuple[int, Any]]:
+    """Results as `map_in_processes` gives them; `waiting` has the items without a result."""
+    futures: dict[Future, int] = {}
     with _pool(function, workers) as pool:
-        futures = {pool.submit(_call, item): index for index, item in items.items()}
-        yield from ((futures[future], future.result()) for future in as_completed(futures))
+        while True:
+            for index, item in islice(items, 2 * workers + 1 - len(futures)):
+                waiting[index] = item
+                futures[pool.submit(_call, item)] = index
+            if not futures:
+                return
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                index, result = futures.pop(future), future.result()
+                del waiting[index]
+                yield index, result
 
 
 @contextmanager

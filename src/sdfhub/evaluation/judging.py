@@ -17,10 +17,11 @@ from tqdm import tqdm
 
 from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape, draw_rows
-from sdfhub.data.workers import stream_in_processes
+from sdfhub.data.workers import Crashed, map_in_processes
+from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.scoresheet import Judged, write_scores
 from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.metrics import DistanceMetrics, ShapeMetrics, judge_pair
+from sdfhub.geometry.metrics import DistanceMetrics, judge_pair
 from sdfhub.geometry.render import render
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
@@ -116,8 +117,11 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
     judge_one = partial(judge_pair, points=evaluation.points, seed=evaluation.seed)
-    metrics = list(stream_in_processes(judge_one, pairs(), workers))
-    columns = zip(roles, cast(list[ShapeMetrics], metrics), pictures, strict=True)
+    judged = dict(map_in_processes(judge_one, pairs(), workers))
+    metrics = [judged[index] for index in range(len(roles))]
+    if any(isinstance(row, Crashed) for row in metrics):
+        raise SdfhubError("a process that judges died twice: out of memory? try evaluate.workers=0")
+    columns = zip(roles, metrics, pictures, strict=True)
     return [Judged(role, shape, row, drawn) for (role, shape, _), row, drawn in columns]
 
 

@@ -79,7 +79,7 @@ def observations_of(shapes: Sequence[StoredShape], samples: int | None, seeds: S
     observations = []
     for shape, seed in zip(shapes, seeds, strict=True):
         if samples is None:
-            rows = np.concatenate([shape.outside, shape.inside])
+            rows = np.concatenate([shape.read("outside"), shape.read("inside")])
         else:
             rows = signed_samples(shape, samples, np.random.default_rng(seed))
         observations.append(Observation.of_samples(rows[:, :3], rows[:, 3]))

@@ -58,7 +58,7 @@ class ScanKind:
         """A simulated scan of a shape, in the normalised frame, by its number."""
         rng = np.random.default_rng([shape_seed(shape), number])
         if self.kind == "samples":
-            rows = np.concatenate([shape.outside, shape.inside]).astype(np.float64)
+            rows = np.concatenate([shape.read("outside"), shape.read("inside")]).astype(np.float64)
             return Scan(rows[:, :3], sdf=rows[:, 3])
         if shape.mesh is None:
             raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")

@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch.utils.data import Dataset
 
-from sdfhub.data.store.stored_shape import COLUMNS, StoredShape, draw_rows, draw_signed, refuse_empty
+from sdfhub.data.store.stored_shape import COLUMNS, StoredShape, draw_rows, refuse_empty, signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Batch
 
@@ -84,7 +84,7 @@ class StepBatches(Dataset):
         for row, points, oriented in zip(rows, samples, surface, strict=True):
             copy, index = divmod(int(row), len(self.shapes))
             rng = self.generator(step, row)
-            draw_signed(points, self.shapes[index], rng)
+            signed_samples(self.shapes[index], len(points), rng, points)
             draw_rows(oriented, self.shapes[index], "surface", rng)
             if copy:
                 of_samples, of_surface = loading.augmentation.factors(copy, int(row), loading.seed)

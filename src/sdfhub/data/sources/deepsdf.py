@@ -1,10 +1,8 @@
 """Samples that DeepSDF's own preprocessing wrote: no meshes needed."""
 
-import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +36,7 @@ class DeepSdfSource(SourceOfFiles):
     def __init__(
         self,
         root: str,
-        categories: Mapping[str, Any] | None = None,
+        categories: Mapping | None = None,
         train_split: str | None = None,
         test_split: str | None = None,
     ):
@@ -49,8 +47,7 @@ class DeepSdfSource(SourceOfFiles):
         files = [file for file in sorted(self.root.rglob("*.npz")) if _PARAMETERS not in file.parts]
         if not files:
             raise SdfhubError(f"data.source.root={self.root}: holds no .npz files with DeepSDF's samples")
-        if any(file.parent.name in self.category_of for file in files):
-            files = [file for file in files if file.parent.name in self.category_of]
+        files = [file for file in files if file.parent.name in self.category_of] or files
         paths = {file: file.relative_to(self.root).with_suffix("").as_posix() for file in files}
         ids = {file: shape_id(path, self.category_of, self.root.name) for file, path in paths.items()}
         for id, file in sorted(unique_ids(ids, self.root).items()):
@@ -62,10 +59,9 @@ class DeepSdfSource(SourceOfFiles):
         return read_samples(file)
 
 
-def by_synset(categories: Mapping[str, Any] | None) -> dict[str, str]:
+def by_synset(categories: Mapping | None) -> dict[str, str]:
     """Category of each synset that the settings of categories name."""
-    items = (categories or {}).items()
-    return {settings["synset"]: name for name, settings in items if settings.get("synset")}
+    return {value["synset"]: name for name, value in (categories or {}).items() if value.get("synset")}
 
 
 def shape_id(path: str, category_of: Mapping[str, str], above: str = "") -> str:
@@ -93,9 +89,8 @@ def read_samples(path: Path) -> ShapeSamples:
         what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
         raise RejectedMesh("wrong_frame", what)
     none, frame = np.zeros((0, 3), dtype=np.float32), frame_of(path) or NORMALIZED
-    return ShapeSamples(
-        rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, {"inside": inside / len(rows)}
-    )
+    share = {"inside": inside / len(rows)}
+    return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, share)
 
 
 def frame_of(path: Path) -> Frame | None:
@@ -124,13 +119,10 @@ def npz_array(path: Path, name: str) -> np.ndarray:
             if np.lib.format.read_magic(file) != (1, 0):  # other headers may claim gigabytes for themselves
                 raise ValueError(f"{name} is not in numpy's format 1.0")
             shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
-            size = math.prod(shape) * dtype.itemsize
-            if dtype.kind != "f" or min(shape, default=0) < 0 or size > MAX_BYTES:
+            content = file.read(MAX_BYTES)
+            if dtype.kind != "f" or file.read(1):  # at its end the archive's checksum is compared
                 raise ValueError(f"{name} is {list(shape)} {dtype}, not some floating-point numbers")
-            array = np.frombuffer(file.read(size), dtype, math.prod(shape))
-            if file.read(1):  # at its end the archive's checksum is compared
-                raise ValueError(f"{name} is longer than its header says")
-            return array.reshape(shape, order="F" if is_fortran else "C")
+            return np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
     except (MemoryError, RecursionError):
         raise
     except Exception as error:  # zip archives and numpy's headers break in many ways

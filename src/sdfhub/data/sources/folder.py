@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, StringConstraints
 
@@ -35,8 +35,7 @@ class SourceOfFiles(Source):
         self.root = Path(os.path.abspath(root))
         self.train_split = train_split and os.path.abspath(train_split)
         self.test_split = test_split and os.path.abspath(test_split)
-        place = self.root.resolve()
-        self.name = f"{kind}-{folder_safe(place.name)}-{sources.digits(place)}"
+        self.name = f"{kind}-{folder_safe(self.root.resolve().name)}-{sources.digits(self.root.resolve())}"
         self._files: dict[str, Path] = {}
 
     @abstractmethod
@@ -53,8 +52,7 @@ class SourceOfFiles(Source):
             raise SdfhubError(f"data.source.root={self.root}: {what}; set it to the folder of your shapes")
         listed = list(self.listed())
         self._files = {shape.id: file for shape, file, _ in listed}
-        paths = [(shape, path) for shape, _, path in listed]
-        return sources.with_roles(paths, self.train_split, self.test_split)
+        return sources.with_roles([(s, path) for s, _, path in listed], self.train_split, self.test_split)
 
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
         if not self._files:
@@ -95,13 +93,8 @@ class FolderSource(SourceOfFiles):
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         below = {path: path.relative_to(self.root).with_suffix("") for path in self.root.rglob("*")}
-        ids = {
-            path: _id(part)
-            for path, part in below.items()
-            if path.suffix.lower() in FORMATS
-            and path.is_file()
-            and not re.search(r"(^|/)\.", part.as_posix())
-        }
+        meshes = (path for path in below if path.suffix.lower() in FORMATS and path.is_file())
+        ids = {path: _id(below[path]) for path in meshes if not re.search(r"(^|/)\.", str(below[path]))}
         if not ids:
             raise SdfhubError(f"data.source.root={self.root}: holds no mesh files ({' '.join(FORMATS)})")
         there = sorted({id.partition("/")[0] for id in ids.values()})
@@ -127,8 +120,8 @@ def _fingerprint(file: Path) -> str:
     if file.suffix.lower() == ".gltf":
         with suppress(ValueError, AttributeError, TypeError, RecursionError):  # reading says what is wrong
             buffers = [buffer_path(file.parent, name) for name in buffer_names(json.loads(file.read_bytes()))]
-            parts = [digest, *(file_sha256(buffer) for buffer in buffers if buffer)]
-            digest = hashlib.sha256("".join(parts).encode()).hexdigest()
+            parts = "".join(file_sha256(buffer) for buffer in buffers if buffer)
+            digest = hashlib.sha256((digest + parts).encode()).hexdigest()
     return digest
 
 
@@ -141,8 +134,7 @@ class Category(BaseModel):
 class ShapeNetSource(SourceOfFiles):
     """ShapeNetCore as it unpacks: models `<root>/<synset>/<model>/`, their meshes as in version 1 or 2.
 
-    A model is known by its file's size and date, not its content: hashing ShapeNet at every start takes
-    minutes.
+    A model is known by its file's size and date: hashing ShapeNet at every start takes minutes.
 
     Args:
         categories: name -> {synset}.
@@ -151,11 +143,7 @@ class ShapeNetSource(SourceOfFiles):
     """
 
     def __init__(
-        self,
-        categories: Mapping[str, Any],
-        root: str,
-        train_split: str | None = None,
-        test_split: str | None = None,
+        self, categories: Mapping, root: str, train_split: str | None = None, test_split: str | None = None
     ):
         super().__init__("shapenet", root, train_split, test_split)
         self.categories = sorted(sources.checked_categories(categories, Category).items())

@@ -6,7 +6,6 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -24,59 +23,32 @@ from sdfhub.whole_file import write_whole
 MEASURES = ".measured.json"  # a cache: faces, size and hash of the models seen so far, by file and date
 CATALOGUE = "PluginFurnitureCatalog.properties"
 MAX_CATALOGUE, MAX_MODEL = 16 << 20, 256 << 20  # bytes unpacked: a small archive may claim any size
-NOTHING = re.compile("(?!)")  # is found nowhere
 AIRCRAFT_CREDITS = {"author": "the FlightGear team", "licence": "GPL-2+"}
 
 
-class Catalogue(BaseModel, extra="forbid"):
-    """Which furniture a category takes: regular expressions of catalogue names, lower case."""
+class Choice(BaseModel, extra="forbid"):
+    """Which models a category takes: regular expressions of their names, lower case, and their least size."""
 
-    include: re.Pattern[str]
-    exclude: re.Pattern[str] | None = None
-
-
-class Aircraft(BaseModel, extra="forbid"):
-    """Which aircraft a category takes: those whose path `exclude` does not find, of so many triangles."""
-
+    include: re.Pattern[str] | None = None
     exclude: re.Pattern[str] | None = None
     min_faces: int = 1
+
+    def takes(self, name: str) -> bool:
+        included = not self.include or self.include.search(name.lower())
+        return bool(included and not (self.exclude and self.exclude.search(name.lower())))
+
+
+class Catalogue(Choice):
+    """A choice of furniture by its name in the catalogue."""
+
+    include: re.Pattern[str]
 
 
 class Rules(BaseModel):
     """What a category takes of the two packages; it may have other settings, too."""
 
     catalogue: Catalogue | None = None
-    aircraft: Aircraft | None = None
-
-
-@dataclass(frozen=True)
-class _Model:
-    """A mesh file below the root (`member` empty) or within an archive, and the category it falls into."""
-
-    category: str
-    file: Path
-    member: str
-    credits: dict[str, str]
-    min_faces: int = 1
-
-    def content(self) -> bytes:
-        return read_model(self.file, self.member) if self.member else self.file.read_bytes()
-
-    def triangles(self) -> Mesh:
-        name = self.member or self.file.name
-        if self.file.stat().st_size > MAX_BYTES:
-            raise RejectedMesh("corrupt_file", f"{self.file} is larger than any aircraft or library")
-        return triangles_of(self.content(), Path(name).suffix.lower(), f"{self.file.name}: {name}")
-
-    def measured(self) -> dict[str, Any]:
-        """Faces, hash, and extents and area, which twins share; a file that cannot be read has no faces."""
-        try:
-            vertices, faces = self.triangles()
-        except RejectedMesh:
-            return {"faces": 0}
-        area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
-        twin = " ".join(f"{value:.4g}" for value in (*np.ptp(vertices[faces.ravel()], axis=0), area))
-        return {"faces": len(faces), "twin": twin, "sha256": hashlib.sha256(self.content()).hexdigest()}
+    aircraft: Choice | None = None
 
 
 class OpenSource(Source):
@@ -96,7 +68,7 @@ class OpenSource(Source):
 
     def __init__(self, categories: Mapping[str, Any], root: str = "data/open"):
         self.rules, self.root = checked_categories(categories, Rules), Path(root)
-        self._models: dict[str, _Model] = {}
+        self._places: dict[str, tuple[Path, str]] = {}
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
@@ -105,20 +77,20 @@ class OpenSource(Source):
         with suppress(OSError, ValueError, TypeError):
             known |= json.loads((self.root / MEASURES).read_text())
         before, shapes, seen = len(known), [], set()
-        for model in self._candidates():
-            state, below = model.file.stat(), model.file.relative_to(self.root).as_posix()
-            key = f"{below} {state.st_size} {state.st_mtime_ns} {model.member}"
-            measure = known.get(key) or model.measured()
+        for category, choice, file, member, credits in self._candidates():
+            state, below = file.stat(), file.relative_to(self.root).as_posix()
+            key = f"{below} {state.st_size} {state.st_mtime_ns} {member}"
+            measure = known.get(key) or measured(file, member)
             if measure["faces"]:  # a model that cannot be read is tried again: it may be this machine's fault
                 known[key] = measure
-            twin = (model.category, measure.get("twin"))
-            if measure["faces"] < model.min_faces or twin in seen:
+            twin = (category, measure.get("twin"))
+            if measure["faces"] < choice.min_faces or twin in seen:
                 continue
             seen.add(twin)
-            suffix = hashlib.sha256(f"{below}\n{model.member}".encode()).hexdigest()[:6]
-            id = f"{folder_safe(model.category)}/{folder_safe(model.credits['title'].lower())}-{suffix}"
-            shapes.append(Shape(id, model.category, measure["sha256"], credits=model.credits))
-            self._models[id] = model
+            suffix = hashlib.sha256(f"{below}\n{member}".encode()).hexdigest()[:6]
+            id = f"{folder_safe(category)}/{folder_safe(credits['title'].lower())}-{suffix}"
+            shapes.append(Shape(id, category, measure["sha256"], credits=credits))
+            self._places[id] = file, member
         if len(known) > before:
             with suppress(OSError):  # a root that is read-only is measured every time
                 write_whole(self.root / MEASURES, json.dumps(known, indent=1, sort_keys=True))
@@ -128,33 +100,44 @@ class OpenSource(Source):
         return sorted(shapes, key=lambda shape: shape.id)
 
     def load(self, shape: Shape) -> Mesh:
-        if shape.id not in self._models:
+        if shape.id not in self._places:
             self.shapes()
-        return self._models[shape.id].triangles()
+        return read_model(*self._places[shape.id])[0]
 
-    def _candidates(self) -> Iterator[_Model]:
+    def _candidates(self) -> Iterator[tuple[str, Choice, Path, str, dict[str, str]]]:
+        """Category, its choice, file, member of the archive (empty: none) and credits."""
         for category, rules in sorted(self.rules.items()):
-            if rule := rules.catalogue:
+            choice: Choice | None
+            if choice := rules.catalogue:
                 for archive in sorted(self.root.rglob("*.sh3f")):
                     for member, credits in furniture_in(archive):
-                        title = credits["title"].lower()
-                        if rule.include.search(title) and not (rule.exclude or NOTHING).search(title):
-                            yield _Model(category, archive, member, credits)
-            if aircraft := rules.aircraft:
+                        if choice.takes(credits["title"]):
+                            yield category, choice, archive, member, credits
+            if choice := rules.aircraft:
                 for file in sorted(self.root.rglob("AI/Aircraft/**/*.ac")):
                     below = file.as_posix().rpartition("AI/Aircraft/")[2]
-                    if not (aircraft.exclude or NOTHING).search(below.lower()):
-                        title = f"{below.partition('/')[0]} {file.stem}"
-                        credits = AIRCRAFT_CREDITS | {"title": title}
-                        yield _Model(category, file, "", credits, aircraft.min_faces)
+                    if choice.takes(below):
+                        credits = AIRCRAFT_CREDITS | {"title": f"{below.partition('/')[0]} {file.stem}"}
+                        yield category, choice, file, "", credits
+
+
+def measured(file: Path, member: str) -> dict[str, Any]:
+    """Faces, hash, and extents and area, which twins share; a model that cannot be read has no faces."""
+    try:
+        (vertices, faces), sha256 = read_model(file, member)
+    except RejectedMesh:
+        return {"faces": 0}
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum() / 2
+    twin = " ".join(f"{value:.4g}" for value in (*np.ptp(vertices[faces.ravel()], axis=0), area))
+    return {"faces": len(faces), "twin": twin, "sha256": sha256}
 
 
 def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Of a library's OBJ models, in the catalogue's order: name in the archive; author, licence and title."""
     try:
         with zipfile.ZipFile(archive) as library:
-            entries = parse_properties(_content(library, CATALOGUE, MAX_CATALOGUE).decode("latin-1"))
             members = set(library.namelist())
+        entries = parse_properties(_content(archive, CATALOGUE, MAX_CATALOGUE).decode("latin-1"))
     except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
         raise SdfhubError(f"{archive}: not a furniture library ({error}); fetch it again") from error
     for number in sorted(int(key[5:]) for key in entries if re.fullmatch(r"name#\d{1,9}", key)):
@@ -166,15 +149,19 @@ def furniture_in(archive: Path) -> Iterator[tuple[str, dict[str, str]]]:
             yield member, {"author": entry["creator"], "licence": licence, "title": entry["name"]}
 
 
-def read_model(archive: Path, member: str) -> bytes:
-    """The content of a model within its library, of at most MAX_MODEL bytes."""
+def read_model(file: Path, member: str) -> tuple[Mesh, str]:
+    """The mesh in a file or a member of an archive, of at most MAX_MODEL bytes, and its content's sha256."""
+    name = member or file.name
+    if file.stat().st_size > MAX_BYTES:
+        raise RejectedMesh("corrupt_file", f"{file} is larger than any aircraft or library")
     try:
-        with zipfile.ZipFile(archive) as library:
-            return _content(library, member, MAX_MODEL)
+        content = _content(file, member, MAX_MODEL) if member else file.read_bytes()
     except MemoryError:
         raise
     except Exception as error:  # a damaged archive breaks zipfile and zlib in many ways
-        raise RejectedMesh("corrupt_file", f"{archive}: {member}: {error}") from error
+        raise RejectedMesh("corrupt_file", f"{file}: {member}: {error}") from error
+    mesh = triangles_of(content, Path(name).suffix.lower(), f"{file.name}: {name}")
+    return mesh, hashlib.sha256(content).hexdigest()
 
 
 def parse_properties(text: str) -> dict[str, str]:
@@ -185,8 +172,8 @@ def parse_properties(text: str) -> dict[str, str]:
     return {key: re.sub(r"\\(.)", r"\1", value).strip() for key, value in pairs}
 
 
-def _content(library: zipfile.ZipFile, member: str, limit: int) -> bytes:
-    with library.open(member) as file:
+def _content(archive: Path, member: str, limit: int) -> bytes:
+    with zipfile.ZipFile(archive) as library, library.open(member) as file:
         content = file.read(limit + 1)  # the size in its header is not to be trusted
     if len(content) > limit:
         raise RejectedMesh("corrupt_file", f"{member} unpacks to more than {limit >> 20} MiB")

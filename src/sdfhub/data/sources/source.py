@@ -110,22 +110,21 @@ def with_roles(
 
 
 def _ids_listed(shapes: list[tuple[Shape, str]], file: str, role: Role) -> set[str]:
-    names, of_path, of_ending = sorted(set(names_listed(file, role))), defaultdict(list), defaultdict(list)
+    of_path, of_ending = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
     for shape, path in shapes:
         of_path[path].append(shape.id)
         for ending in _endings(path):
             of_ending[ending].append(shape.id)
     ids = {}  # a name that is a path means that file alone; others are the last parts of one, or end in one
-    for name in names:
-        longer, shorter = of_ending.get(name, []), (of_path.get(end, []) for end in _endings(name))
-        ids[name] = of_path.get(name) or [*longer, *chain.from_iterable(shorter)]
-    listed = set(chain.from_iterable(ids.values()))
-    if not listed:
-        raise SdfhubError(f"{file}: none of the {len(names)} {role} shapes it lists is there")
-    if lost := [name for name in names if not ids[name]]:
-        what = f"{len(lost)} of the {len(names)} {role} shapes it lists are not there"
+    for name in sorted(set(names_listed(file, role))):
+        shorter = (id for end in _endings(name) for id in of_path.get(end, []))
+        ids[name] = of_path.get(name) or [*of_ending.get(name, []), *shorter]
+    if not any(ids.values()):
+        raise SdfhubError(f"{file}: none of the {len(ids)} {role} shapes it lists is there")
+    if lost := [name for name in ids if not ids[name]]:
+        what = f"{len(lost)} of the {len(ids)} {role} shapes it lists are not there"
         log.warning(f"{file}: {what}, such as {lost[0]}")
-    return listed
+    return set(chain.from_iterable(ids.values()))
 
 
 def names_listed(file: str, role: Role) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""The store of prepared shapes: samples are made once and mapped into memory ever after.
+"""The store of prepared shapes: samples are made once and read ever after.
 
     root / source name / hash of the preparation / shape id.safetensors
                                                  / index.json, a cache: which files have been checked
