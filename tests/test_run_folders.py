@@ -7,9 +7,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 
+from sdfhub.callbacks.training_record import made_with
 from sdfhub.composition import configuration_folder, plain
 from sdfhub.errors import SdfhubError
-from sdfhub.evaluation.made_with import made_with
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import begin_run
 from sdfhub.tasks.train import refuse_other_shapes

@@ -13,14 +13,11 @@ log = logging.getLogger(__name__)
 @contextmanager
 def locked(path: Path, waiting: str = "") -> Iterator[None]:
     """Holds a lock file, made where it is missing; logs `waiting` where it cannot be had at once."""
-    lock = FileLock(path)
     try:
-        lock.acquire(timeout=0)
+        held = FileLock(path).acquire(timeout=0)
     except Timeout:
         if waiting:
             log.info(waiting)
-        lock.acquire(poll_interval=0.1)
-    try:
+        held = FileLock(path).acquire(poll_interval=0.1)
+    with held:
         yield
-    finally:
-        lock.release()

@@ -6,7 +6,7 @@ in the unit ball; `source = normalised / scale + center`. Sign: negative inside.
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 RADIUS = 1 / 1.03  # of the farthest vertex from the centre, normalised frame (DeepSDF's buffer of 3%)
 _PART = r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,119}"
 SHAPE_ID = rf"^{_PART}(/{_PART})*$"  # such as `chairs/0007`: a path below a folder that never leads out
+UpAxis = Literal["y", "z"]  # of a world
 
 
 def check_id(id: str) -> None:
@@ -33,6 +34,14 @@ def _check(owner: Any, **layouts: tuple) -> None:
         fits = all((want if want == 3 else sizes.setdefault(want, have)) == have for want, have in pairs)
         if not fits or len(array.shape) != len(layout) or array.dtype != dtype:
             raise ValueError(f"{name}: expected {layout} {dtype}, got {list(array.shape)} {array.dtype}")
+
+
+def turned_up(points: np.ndarray, up: UpAxis, wanted: UpAxis) -> np.ndarray:
+    """Points [N, 3] of a world with `up` up in one with `wanted` up; the front looks to +z or -y then."""
+    if up == wanted:
+        return points
+    x, y, z = np.asarray(points).T
+    return np.column_stack([x, -z, y] if wanted == "z" else [x, z, -y])
 
 
 class Mesh(NamedTuple):

@@ -16,8 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoa
 from PIL import Image
 
 from sdfhub.geometry.mesh_file import write_row
-from sdfhub.geometry.up_axis import UpAxis, turned_up
-from sdfhub.shapes import Mesh
+from sdfhub.shapes import Mesh, UpAxis, turned_up
 
 TENSORBOARD_VERTICES = 60_000
 """TensorBoard's mesh plugin indexes vertices with 16 bits and draws garbage beyond 65,535."""

@@ -1,13 +1,18 @@
 """Seconds, steps and last losses of a training, for `metrics.json`."""
 
+import platform
+import re
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import lightning as L
 import numpy as np
+import torch
 from torch import Tensor
 
 from sdfhub.model.autodecoder import AutoDecoder
@@ -74,3 +79,19 @@ def clock_stopped(trainer: L.Trainer) -> Iterator[None]:
     yield
     for record in running:
         record.start_clock()
+
+
+def made_with(trainer: L.Trainer) -> dict[str, str]:
+    """Versions and hardware as plain text by name."""
+    device, cpuinfo = trainer.strategy.root_device, Path("/proc/cpuinfo")
+    name = re.search(r"model name\s*: (.*)", cpuinfo.read_text("utf-8")) if cpuinfo.exists() else None
+    processor = name[1] if name else platform.processor() or "unknown"
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("sdfhub", "torch", "lightning", "numpy")},
+        "system": f"{platform.system()} {platform.machine()}",
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else processor,
+        "threads": str(torch.get_num_threads()),
+        "processes": str(trainer.world_size),
+        "precision": str(trainer.precision),
+    }

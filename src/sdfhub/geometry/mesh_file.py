@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfhub.geometry.up_axis import UpAxis, turned_up
-from sdfhub.shapes import Mesh
+from sdfhub.shapes import Mesh, UpAxis, turned_up
 from sdfhub.whole_file import write_whole
 
 FORMATS = ("ply", "obj", "glb")  # formats of written meshes

@@ -6,7 +6,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.geometry.surface_sampling import sphere_directions
-from sdfhub.geometry.up_axis import UpAxis, turned_up
+from sdfhub.shapes import UpAxis, turned_up
 from sdfhub.triangles import face_normals
 
 _CLAY = np.array([0.30, 0.46, 0.72])  # surface colour, linear RGB

@@ -115,10 +115,7 @@ class GaussNewtonFit:
         return least, codes[which]
 
     def _descend(self, problem: Problem, rows: Rows, starts: Descents, every: int) -> tuple[Descents, Tensor]:
-        """Where descents on every so many-th row end, and the objectives [D] there.
-
-        Source: Levenberg 1944 and Marquardt 1963.
-        """
+        """Ends of descents on every so many-th row, objectives [D] there (Levenberg 1944, Marquardt 1963)."""
         size = max(1, ROWS_TOGETHER * every // rows.points.shape[1])
         shape, turn, unknowns, damping = (part.clone() for part in starts)
 

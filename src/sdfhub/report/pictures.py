@@ -16,10 +16,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.render import render
-from sdfhub.geometry.up_axis import UpAxis, turned_up
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
 from sdfhub.report.rows import Group, Row
-from sdfhub.shapes import Frame
+from sdfhub.shapes import Frame, UpAxis, turned_up
 
 PIXELS, PAPER = 208, 0.955
 """Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""

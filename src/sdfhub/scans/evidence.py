@@ -96,13 +96,10 @@ class Evidence:
         return replace(self._with_surface(points, bounds, noise, rng), partial=True)
 
     def _beside(self, points, normals, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
-        """Places [Q, 3] a step before and behind seen points, and the signed steps [Q].
-
-        Without given normals, only the flatter half of the surface has such that can be trusted.
-        """
+        """Places [Q, 3] a step before and behind seen points, and the signed steps [Q]."""
         flat = np.arange(len(points))
         if normals is None:
-            normals, scatter = tangent_planes(points)
+            normals, scatter = tangent_planes(points)  # to be trusted on the flatter half
             flat = np.flatnonzero(scatter <= np.median(scatter))
         away = np.einsum("ij,ij->i", normals, points - sensor) > 0
         normals = np.where(away[:, None], -normals, normals)

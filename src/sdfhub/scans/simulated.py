@@ -11,11 +11,10 @@ from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.render import seen_from
 from sdfhub.geometry.surface_sampling import sample_surface
-from sdfhub.geometry.up_axis import UpAxis
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan
-from sdfhub.shapes import NORMALIZED, NormalizedMesh
+from sdfhub.shapes import NORMALIZED, NormalizedMesh, UpAxis
 
 NOISES = (0.0, 0.0035, 0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056)  # told apart, normalised frame
 HALF_VIEW = np.tan(np.radians(24))  # half a picture's width at distance 1: holds the unit ball from 2.5 away

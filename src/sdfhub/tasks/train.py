@@ -21,14 +21,13 @@ from pydantic import Field
 
 from sdfhub.callbacks.checkpoints import WholeFileIO
 from sdfhub.callbacks.progress import fitting_callbacks
-from sdfhub.callbacks.training_record import TrainingRecord
+from sdfhub.callbacks.training_record import TrainingRecord, made_with
 from sdfhub.checkpoint_file import LAST, read_checkpoint
 from sdfhub.composition import instantiate, plain, with_absolute_paths
 from sdfhub.data.loading import SdfDataModule
 from sdfhub.described import check, located
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import Evaluation, evaluate_model
-from sdfhub.evaluation.made_with import made_with
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.optimisers import Optimisation
 from sdfhub.multirun.search import objective

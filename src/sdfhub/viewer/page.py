@@ -12,10 +12,10 @@ from torch import Tensor
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface_sampling import sample_surface
-from sdfhub.geometry.up_axis import turned_up
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import read_scan
+from sdfhub.shapes import turned_up
 from sdfhub.space import Space
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
