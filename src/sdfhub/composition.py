@@ -1,6 +1,7 @@
 """A composed config as objects and as plain data. Whatever the user's own config names is made."""
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -43,6 +44,26 @@ def instantiate(config: Any, key: str, **given: Any) -> Any:
         if isinstance(cause, SdfhubError | KeyboardInterrupt):
             raise cause from error
         raise SdfhubError(f"{key}: {one_line(cause)}") from error
+
+
+def drop_replaced(config: DictConfig, words: Sequence[str]) -> None:
+    """Where a word such as `activation._target_=mypkg.Mine` replaces a class, drops settings of the old one.
+
+    Those that the new one takes or that a word gives stay, the latter to be refused by name if need be.
+    """
+    given = {word.lstrip("+").partition("=")[0] for word in words}
+    for key in given:
+        node_key, _, name = key.rpartition(".")
+        node = OmegaConf.select(config, node_key)
+        # an optimiser of PyTorch leaves the other settings of `optim` to sdfhub
+        if name != "_target_" or node_key == "optim" or not isinstance(node, DictConfig):
+            continue
+        takes = inspect.signature(located(node._target_, node_key)).parameters
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values()):
+            OmegaConf.set_struct(node, False)
+            for setting in set(node) - {*takes, *RESERVED}:
+                if f"{node_key}.{setting}" not in given:
+                    del node[setting]
 
 
 def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:

@@ -62,9 +62,7 @@ def describe(value: Any, key: str = "") -> Any:
     elif isinstance(value, Described):
         arguments = vars(value).get("_arguments", {})
     else:
-        raise SdfhubError(
-            f"{key}: {_path(type(value))} cannot say how it was made; derive it from sdfhub's own class"
-        )
+        raise SdfhubError(f"{key}: {_path(type(value))} cannot say how it was made; make it a dataclass")
     return {"_target_": _path(type(value)), **describe(arguments, key)}
 
 

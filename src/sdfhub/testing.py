@@ -124,7 +124,7 @@ def _check_gradient(what: str, module: nn.Module, at: Tensor, function: Callable
     try:
         torch.autograd.gradcheck(call, (at, *weights), atol=TOLERANCE, rtol=TOLERANCE, fast_mode=True)
     except RuntimeError as error:
-        raise AssertionError(f"{what}: {str(error).splitlines()[0]}") from error
+        raise AssertionError(f"{what}: {' '.join(str(error).split())[:160]}") from error
 
 
 def _shaken(module: Any) -> Any:

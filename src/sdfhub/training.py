@@ -8,7 +8,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import open_dict
 
-from sdfhub.composition import configuration_folder
+from sdfhub.composition import configuration_folder, drop_replaced
 from sdfhub.described import trusted_packages
 from sdfhub.multirun.names import register_resolvers
 from sdfhub.opening import load
@@ -37,6 +37,7 @@ def train(overrides: Sequence[str] = (), trust: str | Sequence[str] = ()) -> Spa
         config.hydra.runtime.output_dir = str(folder)
         HydraConfig.instance().set_config(config)
         del config["hydra"]
+    drop_replaced(config, overrides)
     folder.mkdir(parents=True, exist_ok=True)
     train_into(config, folder)
     return load(folder, trust=trusted_packages(trust))

@@ -8,10 +8,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sdfhub.composition import configuration_folder, one_line
+from sdfhub.composition import configuration_folder, drop_replaced, one_line
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import register_resolvers
 
@@ -35,6 +36,7 @@ def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> No
 
     def guarded(config: DictConfig) -> float | None:
         try:
+            drop_replaced(config, HydraConfig.get().overrides.task)
             return task(config)
         except (SdfhubError, OmegaConfBaseException, OSError, MemoryError) as error:
             if verbose:
