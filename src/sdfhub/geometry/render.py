@@ -93,10 +93,8 @@ def _normals(vertices, faces, hits, seen, directions) -> tuple[np.ndarray, np.nd
 
 
 def _light(scene: EmbreeScene, points: np.ndarray, normals: np.ndarray, subpixel: np.ndarray) -> np.ndarray:
-    """[N, 3] light of a soft key and of a sky dome at points [N, 3], about 1 on a level plane, with shadows.
-
-    The four samples of a pixel are lit by four interleaved sets of lights: their mean is smooth.
-    """
+    """[N, 3] light of a key and a sky dome at points [N, 3], about 1 on a level plane, with shadows."""
+    # a pixel's four samples are lit by four interleaved sets of lights: their mean is smooth
     key, dome = _unit(_KEY + 0.09 * sphere_directions(12)), sphere_directions(32)
     strength = np.where(dome[:, 2] > -0.15, 0.75 + 0.4 * dome[:, 2], 0.3)  # a pale floor reflects some light
     warm, cool = np.tile([1.0, 0.95, 0.87], (12, 1)) / 3, 0.2 * strength[:, None] * [0.88, 0.95, 1.0]

@@ -69,10 +69,7 @@ def first_fault(error: ValidationError) -> str:
 
 
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
-    """Adds cells to `sweep.json`, and the command that asked for them. Safe side by side.
-
-    Cells of other settings are replaced; of those with one folder the one that names fewest defaults stays.
-    """
+    """Adds cells to `sweep.json`, and the command that asked for them; of one folder the shortest stays."""
     sweep.mkdir(parents=True, exist_ok=True)
     with locked(sweep / ".lock"):
         old = read_plan(sweep) if (sweep / PLAN).exists() else Plan()

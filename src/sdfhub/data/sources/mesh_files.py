@@ -37,10 +37,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def triangles_of(content: bytes, suffix: str, name: str, folder: Path | None = None) -> Mesh:
-    """The triangles of the whole content of a mesh file, called `name` in messages; see `read_mesh`.
-
-    A .gltf finds its buffers in `folder`; None forbids other files.
-    """
+    """The triangles of a mesh file's content; a .gltf finds its buffers in `folder` (None: nowhere)."""
     if not content.strip():
         raise RejectedMesh("empty_file", f"{name} holds nothing")
     if suffix == ".obj" and (bad := _BAD_NUMBER.search(content)):
@@ -77,10 +74,8 @@ def check_length(content: bytes, suffix: str) -> None:
         promised = 84 + 50 * int.from_bytes(content[80:84], "little")
     elif suffix == ".ply" and b"\nformat ascii" in content[:1000]:
         head, _, body = content.partition(b"end_header")
-        promised, held = (
-            sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE))),
-            _lines(body),
-        )
+        rows = re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE)
+        promised, held = sum(map(int, rows)), _lines(body)
     elif suffix == ".off" and (counts := _OFF_COUNTS.match(content)):
         promised, held = sum(map(int, counts.groups())), _lines(content[counts.end() :])
     if promised > held:
@@ -93,10 +88,7 @@ def _lines(body: bytes) -> int:
 
 
 def _gltf_buffers(content: bytes, suffix: str, folder: Path | None) -> dict[str, bytes]:
-    """The files that a glTF names; its paths are not trusted.
-
-    Refuses one whose vertices trimesh would replace by zeros, or that claims more than memory holds.
-    """
+    """The files that a glTF names; refuses vertices that trimesh would take for zeros, or too many."""
     if suffix == ".glb":
         content, folder = content[20 : 20 + int.from_bytes(content[12:16], "little")], None
     scene = json.loads(content)
@@ -125,12 +117,10 @@ def buffer_names(scene: dict) -> list[str]:
 
 
 def buffer_path(folder: Path | None, name: str) -> Path | None:
-    """Where a file that a .gltf in `folder` names lies, or None where that is not below it, or too large.
-
-    Names are percent-encoded; some exporters write them as they are.
-    """
+    """Where a file that a .gltf in `folder` names lies, or None where that is not below it, or too large."""
     if not folder:
         return None
+    # names are percent-encoded, but some exporters write them as they are
     paths = [(folder / spelling).resolve() for spelling in (name, unquote(name))]
     paths = [path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file()]
     return paths[0] if paths and paths[0].stat().st_size <= MAX_BYTES else None
