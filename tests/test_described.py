@@ -59,7 +59,7 @@ def test_a_file_builds_no_other_class(target, tmp_path, monkeypatch):
 
 
 def test_what_cannot_say_how_it_was_made_is_refused():
-    with pytest.raises(SdfhubError, match="encoding: .*derive it from sdfhub"):
+    with pytest.raises(SdfhubError, match="encoding: .*make it a dataclass"):
         describe(torch.nn.Linear(2, 2), "encoding")
 
 

@@ -14,6 +14,8 @@ from sdfhub.model.autodecoder import AutoDecoder
 from tests.tiny import TINY, run_command, scores, train_tiny
 
 PACKAGE = """
+from dataclasses import dataclass
+
 import lightning as L
 import torch
 
@@ -36,6 +38,14 @@ class Radius(sdfhub.Encoding):
         return torch.cat([points, points.square().sum(-1, keepdim=True)], dim=-1)
 
 
+@dataclass
+class Linear:
+    final: float = 0.0
+
+    def __call__(self, progress):
+        return 1 + (self.final - 1) * progress
+
+
 class Counter(L.Callback):
     steps = 0
 
@@ -54,8 +64,7 @@ def mypkg(tmp_path, monkeypatch) -> Path:
     sys.modules.pop("mypkg", None)
 
 
-OWN = ["activation=relu", "activation._target_=mypkg.Snake", "+activation.a=2"]
-OWN += ["encoding=none", "encoding._target_=mypkg.Radius"]
+OWN = ["activation._target_=mypkg.Snake", "+activation.a=2", "encoding._target_=mypkg.Radius"]
 
 
 def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_exported_by_trust(
@@ -81,7 +90,8 @@ def test_an_activation_and_an_encoding_of_ones_own_train_and_are_judged_and_expo
 @pytest.mark.parametrize(
     "words",
     [
-        ["activation=relu", "activation._target_=torch.nn.GELU"],
+        ["activation._target_=torch.nn.GELU"],
+        ["optim.schedule._target_=mypkg.Linear", "optim.schedule.final=0.1"],
         ["optim._target_=torch.optim.AdamW", "+optim.weight_decay=0.01"],
         ["+callbacks.mine._target_=mypkg.Counter"],
         ["+callbacks.swa={_target_: lightning.pytorch.callbacks.StochasticWeightAveraging, swa_lrs: 1e-3}"],

@@ -124,7 +124,7 @@ def test_limits_are_measured_once_a_run_and_kind(run, scans, tmp_path, monkeypat
     assert len(entry["residuals"]) == len(entry["doubts"]) == len(entry["shapes"]) == 3
     assert entry["shapes"][:2] == ["chairs/0007", "chairs/0009"], "the held-out ones first"
     assert min(entry["doubts"]) > 3 * first[0].doubt
-    monkeypatch.setattr(task, "unseen_shapes", None)  # a second measurement would fail
+    monkeypatch.setattr(task, "unseen_shapes", lambda *_: pytest.fail("a second measurement"))
     again = reconstructed(run, f"scans={scans / 'bare.npy'}", f"out={tmp_path}", "calibration.shapes=3")
     assert again == first
 

@@ -35,7 +35,8 @@ class FakeShape:
     def rows(self, name: str) -> int:
         return len(getattr(self, name))
 
-    def read(self, name: str, start: int, count: int) -> np.ndarray:
+    def read(self, name: str, start: int = 0, count: int | None = None) -> np.ndarray:
+        count = self.rows(name) if count is None else count
         return np.take(getattr(self, name), np.arange(start, start + count), axis=0, mode="wrap")
 
     def read_into(self, rows: np.ndarray, name: str, start: int) -> None:

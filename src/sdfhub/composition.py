@@ -47,10 +47,8 @@ def instantiate(config: Any, key: str, **given: Any) -> Any:
 
 
 def drop_replaced(config: DictConfig, words: Sequence[str]) -> None:
-    """Where a word such as `activation._target_=mypkg.Mine` replaces a class, drops settings of the old one.
-
-    Those that the new one takes or that a word gives stay, the latter to be refused by name if need be.
-    """
+    """Where a word such as `activation._target_=mypkg.Mine` replaces a class, drops settings of the old one
+    but for those that the new one takes or that a word gives."""
     given = {word.lstrip("+").partition("=")[0] for word in words}
     for key in given:
         node_key, _, name = key.rpartition(".")
@@ -58,12 +56,15 @@ def drop_replaced(config: DictConfig, words: Sequence[str]) -> None:
         # an optimiser of PyTorch leaves the other settings of `optim` to sdfhub
         if name != "_target_" or node_key == "optim" or not isinstance(node, DictConfig):
             continue
-        takes = inspect.signature(located(node._target_, node_key)).parameters
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in takes.values()):
-            OmegaConf.set_struct(node, False)
-            for setting in set(node) - {*takes, *RESERVED}:
-                if f"{node_key}.{setting}" not in given:
-                    del node[setting]
+        target = located(node._target_, node_key)
+        parameters = inspect.signature(target).parameters.values()
+        hands_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)  # to its bases
+        kinds = inspect.getmro(target) if hands_on and inspect.isclass(target) else (target,)
+        takes = {name for kind in kinds for name in inspect.signature(kind).parameters}
+        OmegaConf.set_struct(node, False)
+        for setting in set(node) - {*takes, *RESERVED}:
+            if f"{node_key}.{setting}" not in given:
+                del node[setting]
 
 
 def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:

@@ -25,8 +25,6 @@ def train(overrides: Sequence[str] = (), trust: str | Sequence[str] = ()) -> Spa
 
     Raises:
         SdfhubError: a setting that is wrong.
-
-    >>> space = sdfhub.train(["experiment=fft_siren", "scale=demo"])
     """
     register_resolvers()
     GlobalHydra.instance().clear()

@@ -16,8 +16,7 @@ from sdfhub.composition import configuration_folder, drop_replaced, one_line
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import register_resolvers
 
-Task = Callable[[DictConfig], float | None]
-"""What a command does with its composed config; a search lowers what is returned."""
+Task = Callable[[DictConfig], float | None]  # of a composed config; a search lowers what is returned
 
 TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p")
 """Hydra's options whose value is the next word."""

@@ -63,10 +63,7 @@ def neighbours(config: DictConfig) -> None:
 def write_gallery(
     space: Space, codes: Tensor, captions: Sequence[str], out: Path, resolution: int, animated: bool = False
 ) -> None:
-    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` and, of steps on a way, `animation.gif`.
-
-    All lie in the normalised frame: a code [S, L] between two shapes, or a new one, has no source.
-    """
+    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` (normalised frame) and maybe `animation.gif`."""
     results = reconstruct(space.decoder, codes, resolution)
     meshes = list(tqdm(results, "meshing", len(codes), leave=False, disable=None))
     pictures = [render(*mesh, up=space.up) for mesh in meshes]

@@ -124,10 +124,8 @@ def visible_surface(mesh: NormalizedMesh, preparation: Preparation, rng: np.rand
 
 
 def _bounds_a_solid(vertices: np.ndarray, faces: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-    """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it.
-
-    So it is at a wall seen from within through a hole, not at a sheet: there it is about 1/2 and -1/2.
-    """
+    """[S] whether the winding number of all faces is near 1 behind a suspect and near 0 before it."""
+    # so it is at a wall seen from within through a hole; at a sheet it is about 1/2 and -1/2
     normals = face_normals(vertices, suspects)
     step = STEP * normals / np.linalg.norm(normals, axis=1)[:, None]
     centre = vertices[suspects].mean(axis=1)
