@@ -224,9 +224,8 @@ def test_a_grid_that_does_not_fit_is_one_clear_line(space, monkeypatch):
         space.mesh(0, resolution=5000)
 
 
-@pytest.mark.parametrize("module", [sdfhub.space, sdfhub.latent.gaussian])
-def test_the_examples_in_the_documentation_run(run, module):
-    failed, tried = doctest.testmod(module, extraglobs={"run": run, "sdfhub": sdfhub})
+def test_the_examples_in_the_documentation_run(run):
+    failed, tried = doctest.testmod(sdfhub.space, extraglobs={"run": run, "sdfhub": sdfhub})
     assert tried > 1 and not failed
 
 
