@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import save_file
 
 import sdfhub
-import sdfhub.latent.gaussian
 import sdfhub.space
 from sdfhub.checkpoint_file import LAST, read_checkpoint, write_checkpoint
 from sdfhub.errors import SdfhubError
