@@ -37,8 +37,9 @@ class RandomShape:
     def rows(self, name: str) -> int:
         return len(getattr(self, name))
 
-    def read(self, name: str, start: int, count: int) -> np.ndarray:
+    def read(self, name: str, start: int = 0, count: int | None = None) -> np.ndarray:
         array = getattr(self, name)
+        count = len(array) if count is None else count
         if start + count <= len(array):
             return array[start : start + count].copy()
         return np.take(array, np.arange(start, start + count), axis=0, mode="wrap")
