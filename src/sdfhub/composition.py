@@ -53,12 +53,12 @@ def drop_replaced(config: DictConfig, words: Sequence[str]) -> None:
     for key in given:
         node_key, _, name = key.rpartition(".")
         node = OmegaConf.select(config, node_key)
-        # an optimiser of PyTorch leaves the other settings of `optim` to sdfhub
         if name != "_target_" or node_key == "optim" or not isinstance(node, DictConfig):
-            continue
+            continue  # an optimiser of PyTorch leaves the other settings of `optim` to sdfhub
         target = located(node._target_, node_key)
-        parameters = inspect.signature(target).parameters.values()
-        hands_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)  # to its bases
+        if not (inspect.isclass(target) or inspect.isfunction(target)):
+            continue  # a compiled function does not say what it takes
+        hands_on = inspect.getfullargspec(target).varkw is not None  # to its bases
         kinds = inspect.getmro(target) if hands_on and inspect.isclass(target) else (target,)
         takes = {name for kind in kinds for name in inspect.signature(kind).parameters}
         OmegaConf.set_struct(node, False)
