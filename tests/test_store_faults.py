@@ -64,7 +64,7 @@ def test_preparation_killed_again_and_again_ends_with_the_same_store(processes, 
         if list(folder.glob("balls/[0-9]*")):
             assert all(shape.is_intact() for shape in Store.open(folder).values())
     time.sleep(0.6 * (processes - 1))  # workers end a moment after the process that they work for
-    for leftover in folder.glob("*/.*"):
+    for leftover in folder.rglob(".*"):
         os.utime(leftover, (1, 1))  # as if an hour had passed
     (folder / "balls/0000.safetensors").unlink(missing_ok=True)
     assert content(fill(root, source)) == content(undisturbed)
