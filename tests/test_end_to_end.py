@@ -1,12 +1,10 @@
-"""The product as a user runs it: the scripts in subprocesses, meshes in, a Chamfer table out."""
+"""The product as a user runs it: the script in processes of its own, meshes in, a Chamfer table out."""
 
 import csv
 import itertools
 import json
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import lightning as L
@@ -26,9 +24,9 @@ from sdfhub.opening import data_of
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS
 from sdfhub.tasks.evaluate import choose_shapes, evaluate
+from tests.commands import ROOT, Command
 from tests.tiny import STORE, build_autodecoder, composed, read_weights, run_command
 
-ROOT = Path(__file__).parents[1]
 OPEN = ROOT / "data" / "open"
 TINY = [
     "scale=demo",
@@ -49,15 +47,6 @@ TINY = [
 ]
 
 
-def run(script: list[str], *overrides: str, expect: int = 0) -> subprocess.CompletedProcess:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    environment.pop("HYDRA_FULL_ERROR", None)
-    command = [sys.executable, *script, *overrides]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280)
-    assert done.returncode == expect, done.stdout[-2000:] + done.stderr[-2000:]
-    return done
-
-
 def only_run(output_root: Path) -> Path:
     (config,) = output_root.glob("*/*/config.yaml")
     return config.parent
@@ -67,8 +56,7 @@ def only_run(output_root: Path) -> Path:
 def trained(tmp_path_factory) -> tuple[Path, str]:
     """One run of train.py on procedural chairs, and what it printed."""
     root = tmp_path_factory.mktemp("trained")
-    done = run(
-        ["train.py"],
+    command = Command(
         *TINY,
         "activation=hosc",
         "encoding=fourier",
@@ -84,7 +72,8 @@ def trained(tmp_path_factory) -> tuple[Path, str]:
         f"data.store={STORE}",
         f"paths.output={root / 'outputs'}",
     )
-    return only_run(root / "outputs"), done.stdout
+    printed = command.output()
+    return only_run(root / "outputs"), printed
 
 
 def test_training_prints_the_table_and_where_everything_is(trained):
@@ -256,13 +245,8 @@ def test_a_continued_run_ends_like_an_uninterrupted_one(tmp_path, monkeypatch, c
     assert run_command(monkeypatch, *common, *snapshots) == 0
     whole = only_run(tmp_path / "whole") / "checkpoints"
     half = whole / "step_0000008.ckpt"
-    run(
-        ["train.py"],
-        *common,
-        f"ckpt_path={half}",
-        "data.loader.workers=1",
-        f"paths.output={tmp_path / 'rest'}",
-    )
+    rest = [f"ckpt_path={half}", "data.loader.workers=1", f"paths.output={tmp_path / 'rest'}"]
+    Command(*common, *rest).output()
     rest = only_run(tmp_path / "rest") / "checkpoints"
     states = [torch.load(path / "last.ckpt", weights_only=True) for path in (whole, rest)]
     assert torch.load(half, weights_only=True)["global_step"] == 8
@@ -297,7 +281,7 @@ def test_two_processes_train_like_one_with_the_same_batch(tmp_path, monkeypatch)
     ]
     assert run_command(monkeypatch, *common, "trainer=cpu", f"paths.output={tmp_path / 'one'}") == 0
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    run(["train.py"], *common, *two, f"paths.output={tmp_path / 'two'}")
+    Command(*common, *two, f"paths.output={tmp_path / 'two'}").output()
     folders = [only_run(tmp_path / name) for name in ("one", "two")]
     for tag in ("loss/sdf", "loss/normal", "loss/code", "loss/total"):
         one, both = (curve(folder, tag) for folder in folders)

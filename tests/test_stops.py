@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from sdfhub.checkpoint_file import read_checkpoint
-from tests.test_end_to_end import ROOT, TINY, run
+from tests.commands import ROOT, Command
+from tests.test_end_to_end import TINY
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +60,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory) -> tuple[Path, dict[str, torch.Tensor]]:
     root = tmp_path_factory.mktemp("stops")
-    run(["train.py"], *overrides(root, root / "whole"))
+    Command(*overrides(root, root / "whole")).output()
     return root, weights(root / "whole")
 
 
@@ -81,10 +82,9 @@ def test_a_training_told_to_stop_leaves_a_checkpoint_its_status_and_goes_on(numb
     told, _ = process.communicate(timeout=60)
     assert process.returncode == status, told
     assert f"{number.name}: stopping after this step" in told and "Traceback" not in told
-    done = run(["train.py"], *words)
-    assert "continues from last.ckpt" in done.stdout
+    assert "continues from last.ckpt" in Command(*words).output()
     assert_same(folder, expected)
-    assert "finished before" in run(["train.py"], *words).stdout
+    assert "finished before" in Command(*words).output()
 
 
 def test_a_job_that_slurm_queues_again_goes_on(undisturbed, tmp_path):
@@ -111,7 +111,7 @@ def test_a_training_killed_again_and_again_ends_like_an_undisturbed_one(undistur
         process = begun(overrides(root, folder), folder)
         process.kill()
         process.communicate()
-    run(["train.py"], *overrides(root, folder))
+    Command(*overrides(root, folder)).output()
     assert_same(folder, expected)
     assert len(list((folder / "checkpoints").iterdir())) <= 2
 
@@ -138,8 +138,7 @@ def test_two_processes_told_to_stop_leave_one_checkpoint_and_go_on(undisturbed):
     assert main.returncode == 143 and "stopped after step" in told and "Traceback" not in told, told
     assert not processes_of(str(folder))
     stopped = read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"]
-    done = run(["train.py"], *words)
-    assert "continues from last.ckpt" in done.stdout
+    assert "continues from last.ckpt" in Command(*words).output()
     assert 0 < stopped < read_checkpoint(folder / "checkpoints" / "last.ckpt")["global_step"] == 400
 
 
@@ -173,5 +172,5 @@ def test_when_one_process_of_many_dies_the_others_end_within_a_minute(victim, un
 def test_one_shape_and_fewer_shapes_than_a_step_train(tmp_path):
     for shapes in (1, 2):
         words = overrides(tmp_path, tmp_path / str(shapes), epochs=2)
-        done = run(["train.py"], *words, f"data.shapes={shapes}", "data.loader.shapes_per_step=64")
-        assert f"{shapes} shape" in done.stdout and (tmp_path / str(shapes) / "metrics.json").is_file()
+        done = Command(*words, f"data.shapes={shapes}", "data.loader.shapes_per_step=64").output()
+        assert f"{shapes} shape" in done and (tmp_path / str(shapes) / "metrics.json").is_file()
