@@ -18,7 +18,11 @@ from tests.tiny import composed, run_command
 CONF = configuration_folder()
 NO_CHOICES = [("data", "default"), ("category", "any")]
 """What all sources share; the categories of a source that has none."""
-CHOICES = sorted({(path.parent.name, path.stem) for path in CONF.glob("*/*.yaml")} - {*NO_CHOICES})
+NO_CHOICES += [("callbacks", name) for name in composed()["callbacks"]]
+"""Parts, which the default lists."""
+CHOICES = {(path.parent.name, path.stem) for path in CONF.glob("*/*.yaml")} - {*NO_CHOICES}
+CHOICES = sorted(choice for choice in CHOICES if choice[0] not in ("sweeps", "hparams_search"))
+"""Sweeps and searches have tests of their own."""
 
 
 def parameters(*words: str) -> int:
@@ -28,15 +32,7 @@ def parameters(*words: str) -> int:
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
 def test_every_choice_composes_and_builds(group, choice, tmp_path):
-    if (
-        group == "callbacks"
-        and (CONF / "callbacks" / "default.yaml").read_text().find(choice) >= 0
-        and choice != "default"
-    ):
-        words = []  # a part of the group, which default lists
-    else:
-        words = [f"{group}={choice}"]
-    config = composed(*words)
+    config = composed(f"{group}={choice}")
     for name in ("logger", "callbacks"):
         if group != name:
             config[name] = {}
@@ -78,17 +74,9 @@ def test_plain_groups_have_the_same_settings_in_every_row_and_experiments_say_th
 
 MISTAKES = {
     "activation.beta=abc": "activation.beta='abc': should be a valid number",
-    "activation.beta=-1": "activation.beta=-1: should be greater than 0",
     "+activation.sharpness=3": "activation.sharpness: no such setting; Hosc takes",
     "activation._target_=mypkg.Nothing": "there is no class mypkg.Nothing",
-    "optim.lr_decoder=fast": "optim.lr_decoder='fast'",
-    "data.held_out=-1": "held_out",
-    "data.loader.samples_per_shape=0": "samples_per_shape",
     "data.preparation.sign=guess": "sign",
-    "decoder.width=0": "width",
-    "encoding.frequencies=0": "frequencies",
-    "evaluate.resolution=1": "resolution",
-    "loss.delta=0": "delta",
     "callbacks.mesh.shapes=0": "shapes",
     "trainer.accelerator=quantum": "quantum",
     "trainer.max_epochs=ten": "trainer",
@@ -108,6 +96,27 @@ def test_a_mistake_is_one_line_that_names_it(word, monkeypatch, capsys, tmp_path
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("sdfhub: error: ") and MISTAKES[word] in lines[-1], lines
     assert not list(tmp_path.rglob("*.safetensors")), "nothing was prepared"
+
+
+OUT_OF_RANGE = {
+    "activation.beta": -1,
+    "optim.lr_decoder": "fast",
+    "data.held_out": -1,
+    "data.loader.samples_per_shape": 0,
+    "decoder.width": 0,
+    "encoding.frequencies": 0,
+    "evaluate.resolution": 1,
+    "loss.delta": 0,
+}
+
+
+def test_a_setting_out_of_range_is_named_before_shapes_are_prepared(tmp_path):
+    config = composed("callbacks=none", "logger=none")
+    for key, value in OUT_OF_RANGE.items():
+        changed = copy.deepcopy(config)
+        OmegaConf.update(changed, key, value)
+        with pytest.raises(SdfhubError, match=key.rpartition(".")[2]):
+            make_parts(changed, tmp_path)
 
 
 @pytest.mark.parametrize("group", ["decoder", "loss", "data", "fit", "evaluate", "validation"])

@@ -301,7 +301,7 @@ COMBINATIONS = list(
 def ball_batches():
     from tests.test_training import batches
 
-    return batches(shapes=4, per_step=4, samples=256, surface=64)
+    return batches(shapes=4, per_step=4, samples=96, surface=24)
 
 
 def fit(module: L.LightningModule, batches, steps: int, callback: L.Callback, **settings) -> None:
@@ -337,7 +337,7 @@ def test_every_combination_lowers_its_loss_from_its_defaults(activation, encodin
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 @pytest.mark.parametrize(("algorithm", "order"), [("norm", 2), ("value", float("inf"))])
 def test_gradients_are_clipped_under_either_precision(algorithm, order, precision, ball_batches):
-    sizes = []
+    sizes, config = [], composed()
 
     class Keep(L.Callback):
         def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
@@ -347,7 +347,7 @@ def test_gradients_are_clipped_under_either_precision(algorithm, order, precisio
     settings = {"precision": precision, "gradient_clip_algorithm": algorithm}
     for limit in (None, -1.0, 1e-3):  # Lightning takes what is not positive for none
         torch.manual_seed(0)
-        module = build_autodecoder(composed(), rows=4)
+        module = build_autodecoder(config, rows=4)
         fit(module, ball_batches, 3, Keep(), gradient_clip_val=limit, **settings)
     assert min(sizes[:3]) > 2e-3 and max(sizes[6:]) <= 1.001e-3
     assert sizes[3:6] == sizes[:3]
@@ -427,6 +427,7 @@ def test_deepsdfs_npz_files_train_without_normals_and_are_judged_by_distances(tm
         "data.held_out=1",
         "trainer.check_val_every_n_epoch=5",
         "callbacks.mesh.resolution=24",
+        "callbacks.mesh.times=1",
         "callbacks.slices.times=1",
         f"data.store={STORE}",
         f"paths.output={tmp_path / 'outputs'}",

@@ -89,7 +89,7 @@ def test_csv_files_of_a_continued_training_stand_beside_those_of_the_first(tmp_p
 
 def test_no_logger_is_no_error(tmp_path):
     assert of_group("none", tmp_path) == []
-    trained(MeshShapes(resolution=16, points=100), Slices(), logger=False)
+    trained(MeshShapes(times=1, resolution=16, points=100), Slices(times=1), logger=False)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

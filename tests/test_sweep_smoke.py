@@ -9,14 +9,16 @@ from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import group_cells
 from tests.browser import empty_page
 from tests.commands import Command
+from tests.test_notebooks import NOTEBOOKS, run_notebook
 
 
 @pytest.fixture(scope="module")
 def smoked(tmp_path_factory) -> dict:
     """The smoke sweep as a user runs it: killed in its second cell, started again, run to its report."""
     root = tmp_path_factory.mktemp("smoke")
-    words = ["-m", "sweeps=smoke", f"paths.output={root / 'outputs'}", f"data.store={root / 'store'}"]
-    sweep = root / "outputs" / "sweeps" / "smoke"
+    outputs = root / "outputs" / "notebooks"
+    words = ["-m", "sweeps=smoke", f"paths.output={outputs}", f"data.store={outputs / 'store'}"]
+    sweep = outputs / "sweeps" / "smoke"
     killed = Command(*words).process
     while killed.exitcode is None and not any(sweep.glob("*seed-1*/checkpoints/last.ckpt")):
         time.sleep(0.05)
@@ -26,7 +28,7 @@ def smoked(tmp_path_factory) -> dict:
     (first,) = sweep.glob("*/metrics.json")
     written = first.stat().st_mtime_ns
     Command(*words).output()
-    return {"sweep": sweep, "states": states, "first": first, "written": written}
+    return {"root": root, "sweep": sweep, "states": states, "first": first, "written": written}
 
 
 def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
@@ -45,6 +47,11 @@ def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
     assert "python train.py -m sweeps=smoke" in (sweep / "report" / "table.md").read_text()
     for name in ("table.md", "table.tex", "table.csv"):
         assert "FFT/SIREN" in (sweep / "report" / name).read_text()
+
+
+def test_the_notebook_about_sweeps_runs_and_finds_this_one_finished(smoked, monkeypatch):
+    run_notebook(NOTEBOOKS[-1], smoked["root"] / "notebooks", monkeypatch)
+    assert smoked["first"].stat().st_mtime_ns == smoked["written"]
 
 
 @pytest.fixture(scope="module")
