@@ -22,7 +22,7 @@ from tests.test_training import batches
 from tests.tiny import build_autodecoder, composed, read_weights
 
 STEPS, EPOCHS = 4, 3
-CONFIG = composed("decoder.width=16", "decoder.code_size=8", "decoder.dropout=0.1", "optim=step")
+CONFIG = composed("decoder.width=16", "decoder.code_size=8", "decoder.dropout=0.1", "optimizer=muon")
 
 
 class At(L.Callback):

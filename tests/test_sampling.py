@@ -87,6 +87,18 @@ def test_samples_lie_where_the_settings_put_them():
     assert np.linalg.norm(samples.mesh.vertices, axis=1).max() == pytest.approx(RADIUS, abs=1e-6)
 
 
+def test_decoys_are_mirrored_points_with_distances_of_their_own():
+    plain, decoys = (
+        prepare_mesh(CHAIR, Preparation(samples=20_000, near_share=0.5, decoy_share=share))
+        for share in (0, 0.3)
+    )
+    places = [samples.points[np.lexsort(np.abs(samples.points).T)] for samples in (plain, decoys)]
+    assert np.array_equal(np.abs(places[0]), np.abs(places[1]))
+    mirrored = (places[0] != places[1]).sum(axis=1)
+    assert mirrored.max() == 1 and mirrored.sum() == 0.3 * 10_000
+    assert errors(decoys, CHAIR) == pytest.approx((1, 0), abs=0.002)
+
+
 def test_rows_come_in_random_order():
     samples = prepare_mesh(CHAIR, FEW)
     steps = np.linalg.norm(np.diff(samples.points, axis=0), axis=1)

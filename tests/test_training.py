@@ -53,6 +53,17 @@ def test_clamped_l1_counts_only_the_band():
     assert torch.isclose(clamped_l1(predicted, target, 0.1), torch.tensor((0.03 + 0 + 0.2 + 0.05) / 4))
 
 
+def test_errors_beyond_the_band_may_count_more():
+    predicted, target = torch.tensor([[0.05, 0.0, 0.2, 0.3]]), torch.tensor([[0.02, 0.2, -0.3, 0.3]])
+    assert torch.isclose(
+        clamped_l1(predicted, target, 0.1, 5.0), torch.tensor((0.03 + 5 * 0.1 + 5 * 0.2) / 4)
+    )
+    parts = dataclasses.replace(LOSS, far_weight=5.0).parts(
+        predicted, target, torch.zeros(1, 2), None, None, 1.0
+    )
+    assert torch.isclose(parts["sdf"], torch.tensor(1.53 / 4))
+
+
 def test_code_prior_is_the_papers_square_or_deepsdfs_norm():
     codes = torch.tensor([[3.0, 4.0], [0.0, 0.0]], requires_grad=True)
     assert code_prior(codes, "squared") == 12.5

@@ -146,7 +146,8 @@ class AutoDecoder(L.LightningModule):
         if math.isinf(self.steps):
             raise SdfhubError("trainer.max_epochs: set it or max_steps; schedules are shares of a training")
         weights = self.decoder.parameters(), self.codes.parameters()
-        optimizer, schedule = self.optim.configure(*weights, steps=int(self.steps))
+        matrices = self.decoder.hidden_matrices()
+        optimizer, schedule = self.optim.configure(*weights, int(self.steps), matrices)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(self, _, gradient_clip_val=None, gradient_clip_algorithm=None) -> None:

@@ -113,6 +113,11 @@ class Decoder(Described, nn.Module):
         head.weight.normal_(0, HEAD_SPREAD / head.in_features**0.5)
         head.bias.zero_()
 
+    def hidden_matrices(self) -> list[nn.Parameter]:
+        """The weights of the layers between the first and the last; with weight norm their directions."""
+        weights = [p for layer in self.layers[1:-1] for p in layer.linear.parameters() if p.ndim == 2]
+        return [weight for weight in weights if weight.shape[1] > 1]  # lengths are a column
+
     def forward(self, points: Tensor, codes: Tensor) -> Tensor:
         """Signed distances [B, N] at points [B, N, 3], normalised frame, of shapes with codes [B, L]."""
         with full_precision(points):  # bfloat16 cannot tell points apart

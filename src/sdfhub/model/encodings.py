@@ -11,6 +11,7 @@ from typing import Annotated
 
 import torch
 from pydantic import Field, PositiveFloat, PositiveInt
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from sdfhub.described import Described
@@ -99,10 +100,34 @@ class Fourier(Encoding):
         def pullback(cotangent: Tensor) -> Tensor:
             by_sine, by_cosine = cotangent[..., first:].chunk(2, dim=-1)
             by_angles = by_sine * cosine - by_cosine * sine
-            by_points = by_angles.unflatten(-1, (3, -1)) @ self.octaves
+            by_points = by_angles.unflatten(-1, (-1, len(self.octaves))) @ self.octaves
             return by_points + cotangent[..., :3] if self.include_points else by_points
 
         return features, pullback
+
+
+class Rotated(Fourier):
+    """Octaves along the axes of turned frames: F = 6 frequencies * frames.
+
+    Along the axes of one frame, a point and its mirror image have two thirds of their features in common, and
+    a space of shapes that are mostly symmetric grows mirror images of the parts of others. The frames are
+    uniformly random and always the same.
+    """
+
+    axes: Tensor
+
+    def __init__(self, frequencies: PositiveInt, frames: PositiveInt = 2):
+        super().__init__(frequencies)
+        self.features *= frames
+        turns = Rotation.random(frames, rng=0).as_matrix().reshape(-1, 3)
+        self.register_buffer("axes", torch.tensor(turns, dtype=torch.float32), persistent=False)
+
+    def forward(self, points: Tensor) -> Tensor:
+        return super().forward(points @ self.axes.T)
+
+    def with_pullback(self, points: Tensor) -> tuple[Tensor, Pullback]:
+        features, pullback = super().with_pullback(points)
+        return features, lambda cotangent: pullback(cotangent) @ self.axes
 
 
 class Gaussian(Encoding):

@@ -15,14 +15,19 @@ from sdfhub.described import Described
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-def clamped_l1(predicted: Tensor, target: Tensor, delta: float) -> Tensor:
+def clamped_l1(predicted: Tensor, target: Tensor, delta: float, far_weight: float = 1.0) -> Tensor:
     """Mean of |clamp(f, delta) - clamp(d, delta)| of field values and signed distances, [B, N]: a scalar.
+
+    Where the target lies beyond delta the error counts `far_weight` times.
 
     A prediction outside [-delta, delta] whose target lies outside on the same side gets no gradient.
 
     Source: the paper's L1 loss (Park et al. 2019, equation 4).
     """
-    return (predicted.clamp(-delta, delta) - target.clamp(-delta, delta)).abs().mean()
+    errors = (predicted.clamp(-delta, delta) - target.clamp(-delta, delta)).abs()
+    if far_weight != 1:
+        errors = torch.where(target.abs() > delta, far_weight * errors, errors)
+    return errors.mean()
 
 
 def code_prior(codes: Tensor, norm: Literal["squared", "l2"]) -> Tensor:
@@ -84,6 +89,7 @@ class SdfLoss(Loss):
     """
 
     delta: PositiveFloat = 0.1  # clamp of signed distances, normalised frame
+    far_weight: PositiveFloat = 1.0  # of errors beyond delta, where pieces float that no near sample sees
     lambda_code: NonNegativeFloat = 1e-4  # weight of the code prior
     code_norm: Literal["squared", "l2"] = "squared"  # |z|^2 or |z|
     warmup: Share = 0.05  # share of training over which lambda_code grows linearly from 0
@@ -96,7 +102,7 @@ class SdfLoss(Loss):
     def parts(self, predicted, target, codes, gradients, normals, progress) -> dict[str, Tensor]:
         """The parts `sdf`, `code` and, where gradients are given, `normal`."""
         warmup = min(1.0, progress / self.warmup) if self.warmup else 1.0
-        parts = {"sdf": clamped_l1(predicted, target, self.delta)}
+        parts = {"sdf": clamped_l1(predicted, target, self.delta, self.far_weight)}
         parts["code"] = self.lambda_code * warmup * code_prior(codes, self.code_norm)
         if gradients is not None and normals is not None:
             parts["normal"] = self.tau * normal_term(gradients, normals)

@@ -68,11 +68,25 @@ class Optimisation:
         return cls(**rates | settings | {"optimizer": partial(make.func, *make.args, **rest)})
 
     def configure(
-        self, decoder: Iterable[nn.Parameter], codes: Iterable[nn.Parameter], steps: int
+        self,
+        decoder: Iterable[nn.Parameter],
+        codes: Iterable[nn.Parameter],
+        steps: int,
+        matrices: Iterable[nn.Parameter] = (),
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LambdaLR]:
-        """The optimiser and its schedule, to be stepped after each of `steps` training steps."""
-        rates = (("decoder", decoder, self.lr_decoder), ("codes", codes, self.lr_codes))
+        """The optimiser and its schedule, to be stepped after each of `steps` training steps.
+
+        Those `matrices` of the decoder are a group of their own, at the optimiser's own rate, where its class
+        says that it takes them.
+        """
+        kind = getattr(self.optimizer, "func", self.optimizer)
+        apart = list(matrices) if getattr(kind, "takes_matrices", False) else []
+        those = set(map(id, apart))
+        rest = [weight for weight in decoder if id(weight) not in those]
+        rates = (("decoder", rest, self.lr_decoder), ("codes", codes, self.lr_codes))
+        groups: list[dict[str, Any]]
         groups = [{"params": list(weights), "lr": rate, "name": name} for name, weights, rate in rates]
+        groups += [{"params": apart, "name": "matrices", "matrices": True}] if apart else []
         chosen = getattr(self.optimizer, "keywords", {}).keys() & {"fused", "foreach", "differentiable"}
         can_fuse = "fused" in inspect.signature(self.optimizer).parameters and not chosen
         optimizer = self.optimizer(groups, fused=True) if can_fuse else self.optimizer(groups)

@@ -73,7 +73,10 @@ def _refuse_doubtful(certain: float, inside: float, limits: Preparation) -> None
 
 
 def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Generator) -> np.ndarray:
-    """[N, 3] float64 points near the surface and in the cube, in Morton order, exact in float32."""
+    """[N, 3] float64 points near the surface and in the cube, in Morton order, exact in float32.
+
+    Some near ones are mirrored in x, y and z in turn.
+    """
     near = round(preparation.samples * preparation.near_share)
     points = np.empty((preparation.samples, 3), np.float32)
     deviation = np.sqrt(preparation.variances).astype(np.float32)
@@ -81,6 +84,8 @@ def sample_points(surface: Surface, preparation: Preparation, rng: np.random.Gen
     jitter = rng.standard_normal((near, 3), np.float32)
     jitter *= deviation[np.arange(near) % len(deviation), None]
     points[:near] += jitter
+    decoys = np.arange(round(near * preparation.decoy_share))
+    points[decoys, decoys % 3] *= -1
     points[near:] = rng.uniform(-1, 1, (preparation.samples - near, 3))
     return points[morton_order(points)].astype(np.float64)  # the distance is that of the point as stored
 

@@ -19,6 +19,8 @@ class Preparation:
     sign: Literal["winding", "vote", "pseudo_normal"] | Callable = "winding"
     samples: PositiveInt = 500_000  # of a shape, signed
     near_share: Annotated[float, Field(ge=0, le=1)] = 0.94  # near the surface; the rest in [-1, 1]^3
+    # of the near ones: mirrored in x, y or z, with their own distances, where a field may mistake sides
+    decoy_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)  # of the jitter
     surface_points: NonNegativeInt = 30_000  # of a shape, oriented
     views: Annotated[int, Field(ge=8)] = 100  # directions from which faces are looked at

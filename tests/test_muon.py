@@ -1,0 +1,78 @@
+"""Muon steps hidden matrices as PyTorch's own, everything else as Adam."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from torch import nn
+
+from sdfhub.model.activations import Siren
+from sdfhub.model.conditioning import Film
+from sdfhub.model.encodings import Identity
+from sdfhub.model.muon import Muon
+from sdfhub.model.optimisers import Cosine, Optimisation
+from tests.test_model import small_decoder
+
+OPTIMISATION = Optimisation(1e-3, 1e-2, Cosine(), optimizer=partial(Muon, lr=4e-3))
+
+
+def gradients(decoder: nn.Module, codes: nn.Parameter) -> None:
+    points = torch.rand(2, 50, 3) - 0.5
+    (decoder(points, codes) - points.norm(dim=-1) + 0.3).abs().mean().backward()
+
+
+@pytest.mark.parametrize("settings", [{}, {"weight_norm": True}, {"conditioning": Film}])
+def test_hidden_matrices_are_what_lies_between_first_layer_and_head(settings):
+    decoder = small_decoder(Siren(15.0, 3.0), Identity(), **settings)
+    shapes = [tuple(matrix.shape) for matrix in decoder.hidden_matrices()]
+    assert shapes == [tuple(layer.linear.weight.shape) for layer in decoder.layers[1:-1]] and shapes
+
+
+def test_steps_are_those_of_pytorchs_muon_beside_adam():
+    torch.manual_seed(0)
+    decoder, codes = small_decoder(Siren(15.0, 3.0), Identity()), nn.Parameter(torch.randn(2, 4))
+    twin, twin_codes = copy.deepcopy(decoder), copy.deepcopy(codes)
+    optimizer, schedule = OPTIMISATION.configure(decoder.parameters(), [codes], 20, decoder.hidden_matrices())
+    assert {group["name"]: len(group["params"]) for group in optimizer.param_groups}.keys() == {
+        *("decoder", "codes", "matrices")
+    }
+    matrices = twin.hidden_matrices()
+    rest = [p for p in twin.parameters() if all(p is not matrix for matrix in matrices)]
+    muon = torch.optim.Muon(matrices, lr=4e-3, weight_decay=0, adjust_lr_fn="match_rms_adamw")
+    adam = torch.optim.Adam([{"params": rest, "lr": 1e-3}, {"params": [twin_codes], "lr": 1e-2}])
+    for step in range(5):
+        factor = OPTIMISATION.factor(step, 20)
+        for group, rate in zip([*muon.param_groups, *adam.param_groups], (4e-3, 1e-3, 1e-2), strict=True):
+            group["lr"] = rate * factor
+        for model, table, optimizers in ((decoder, codes, [optimizer]), (twin, twin_codes, [muon, adam])):
+            torch.manual_seed(step)
+            model.zero_grad()
+            table.grad = None
+            gradients(model, table)
+            for one in optimizers:
+                one.step()
+        schedule.step()
+    for mine, theirs in zip([*decoder.parameters(), codes], [*twin.parameters(), twin_codes], strict=True):
+        assert torch.allclose(mine, theirs, atol=1e-6)
+
+
+def test_its_state_goes_through_a_checkpoint():
+    torch.manual_seed(0)
+    decoder, codes = small_decoder(Siren(15.0, 3.0), Identity()), nn.Parameter(torch.randn(2, 4))
+    twin, twin_codes = copy.deepcopy(decoder), copy.deepcopy(codes)
+    made = OPTIMISATION.configure(decoder.parameters(), [codes], 20, decoder.hidden_matrices())[0]
+    other = OPTIMISATION.configure(twin.parameters(), [twin_codes], 20, twin.hidden_matrices())[0]
+    gradients(decoder, codes)
+    made.step()
+    other.load_state_dict(copy.deepcopy(made.state_dict()))
+    with torch.no_grad():
+        for mine, theirs in zip(
+            [*decoder.parameters(), codes], [*twin.parameters(), twin_codes], strict=True
+        ):
+            theirs.copy_(mine)
+            theirs.grad = mine.grad.clone()
+    made.step()
+    other.step()
+    for mine, theirs in zip([*decoder.parameters(), codes], [*twin.parameters(), twin_codes], strict=True):
+        assert torch.equal(mine, theirs)
