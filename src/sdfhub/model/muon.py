@@ -32,7 +32,8 @@ class Muon(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.999),
     ):
         groups = [{"matrices": False} | group for group in params]
-        of_matrices = {"weight_decay": 0.0, "momentum": momentum, "adjust_lr_fn": "match_rms_adamw"}
+        of_matrices: dict[str, Any] = {"weight_decay": 0.0, "momentum": momentum}
+        of_matrices["adjust_lr_fn"] = "match_rms_adamw"
         matrices = [group for group in groups if group["matrices"]]
         rest = [group for group in groups if not group["matrices"]]
         self._inner: dict[bool, torch.optim.Optimizer] = {}  # they fill in what a group does not say
