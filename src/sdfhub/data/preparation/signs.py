@@ -125,18 +125,40 @@ def pseudo_normal_signs(
 
     Source: Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal.
     """
-    corners, foot = surface.vertices[surface.faces], nearest.foot
-    normals = face_normals(surface.vertices, surface.faces)
-    share = np.ones(len(points))  # smallest barycentric coordinate of the foot
-    for i in range(3):
-        a, b = corners[nearest.face, i], corners[nearest.face, (i + 1) % 3]
-        part = np.einsum("nj,nj->n", np.cross(b - a, foot - a), normals[nearest.face])
-        share = np.minimum(share, part / np.sum(normals**2, axis=1)[nearest.face])
-    inside = np.einsum("nj,nj->n", points - foot, normals[nearest.face]) < 0
-    if (edge := share < 1e-6).any():  # elsewhere the face's own normal decides, at no further cost
-        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        inside[edge] = igl.signed_distance(points[edge], surface.vertices, surface.faces, kind)[0] < 0
-    return Signs(inside, np.ones(len(points), bool))
+    vertices, faces = surface.vertices, surface.faces
+    normals = face_normals(vertices, faces)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]  # [F, 3, 3], edge i from corner i
+    edges /= np.linalg.norm(edges, axis=2, keepdims=True)
+    angles = np.arccos(-np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1)).clip(-1, 1))
+    low, high = np.sort([faces, np.roll(faces, -1, axis=1)], axis=0)
+    _, edge = np.unique(low * len(vertices) + high, return_inverse=True)
+    of_edges = _sums(edge, np.repeat(normals[:, None], 3, axis=1))
+    of_corners = _sums(faces, angles[..., None] * normals[:, None])
+    directions = np.concatenate([normals[:, None], of_edges, of_corners], axis=1)  # [F, 7, 3]
+    shares = _barycentric(nearest, vertices[faces])
+    on_edge = shares < 1e-6
+    part = np.where(on_edge.any(axis=1), 1 + (shares.argmin(axis=1) + 1) % 3, 0)  # the edge opposite
+    part = np.where(on_edge.sum(axis=1) > 1, 4 + shares.argmax(axis=1), part)
+    away = np.einsum("nj,nj->n", points - nearest.foot, directions[nearest.face, part])
+    return Signs(away < 0, np.ones(len(points), bool))
+
+
+def _sums(rows: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """[F, 3, 3]: for every row [F, 3], the sum of all parts [F, 3, 3] of equal rows."""
+    rows = rows.reshape(-1)
+    sums = [np.bincount(rows, parts[..., axis].ravel()) for axis in range(3)]
+    return np.stack(sums, axis=1)[rows].reshape(parts.shape)
+
+
+def _barycentric(nearest: Nearest, corners: np.ndarray) -> np.ndarray:
+    """[N, 3] coordinates of the feet in their triangles [F, 3, 3], those of each corner."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.sum(normals**2, axis=1, keepdims=True)
+    opposite = [np.cross(normals, corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3]) for i in range(3)]
+    slopes, at = np.stack(opposite, axis=1), corners[:, [1, 2, 0]]
+    offsets = np.einsum("fij,fij->fi", slopes, at)
+    return np.einsum("nij,nj->ni", slopes[nearest.face], nearest.foot) - offsets[nearest.face]
 
 
 def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
