@@ -1,3 +1,4 @@
+import igl
 import numpy as np
 import pytest
 from embreex.mesh_construction import TriangleMesh
@@ -10,6 +11,7 @@ from sdfhub.data.preparation.signs import ROOM, SIGN_METHODS, cut_long, nearest_
 from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface
 from sdfhub.geometry.morton import morton_order
 from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
+from sdfhub.geometry.triangle_tree import TriangleTree
 from sdfhub.triangles import face_normals
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
@@ -103,18 +105,42 @@ def test_cutting_stops_before_it_fills_memory():
     assert len(cut_long(corners, faces, 0.01)[1]) <= len(faces) + ROOM
 
 
-def test_distances_to_cut_faces_equal_those_to_whole_ones():
-    import igl
+def soup(kind: str) -> np.ndarray:
+    """Triangles [F, 3, 3]: of a chair, anywhere, long and thin, or without area."""
+    if kind == "chair":
+        vertices, faces = triangles(Manifold.batch_boolean(chair_parts(), OpType.Add))
+        return vertices[faces]
+    corners = np.random.default_rng(0).uniform(-1, 1, (1 if kind == "one" else 301, 3, 3))
+    if kind == "thin":
+        corners[:, 2] = corners[:, 1] + 1e-7 * corners[:, 2]
+    if kind == "empty":
+        corners[::3, 2] = corners[::3, 0]
+        corners[1::3] = corners[1::3, :1]
+        corners[2::3, 2] = 2 * corners[2::3, 1] - corners[2::3, 0]
+    return corners
 
-    mesh = triangles(Manifold.batch_boolean(chair_parts(), OpType.Add))
-    surface, points = surface_and_points(mesh)
-    nearest, tree = nearest_points(points, surface), igl.AABB()
-    tree.init(surface.vertices, surface.faces)
-    squared = tree.squared_distance(surface.vertices, surface.faces, points)[0]
-    np.testing.assert_allclose(nearest.distance, np.sqrt(squared), atol=1e-14)
-    corners = surface.vertices[surface.faces[nearest.face]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    np.testing.assert_allclose(np.einsum("nj,nj->n", nearest.foot - corners[:, 0], normals), 0, atol=1e-12)
+
+def to_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[N] distances to the nearest of the segments from a [F, 3] to b [F, 3]."""
+    along, apart = b - a, points[:, None] - a
+    share = np.sum(apart * along, axis=2) / np.maximum(np.sum(along**2, axis=1), 1e-300)
+    return np.linalg.norm(apart - share.clip(0, 1)[..., None] * along, axis=2).min(axis=1)
+
+
+@pytest.mark.parametrize("kind", ["chair", "one", "anywhere", "thin", "empty"])
+def test_the_tree_finds_what_libigl_finds(kind):
+    corners, points = soup(kind), np.random.default_rng(1).uniform(-1.2, 1.2, (3000, 3))
+    points[::10] = corners[np.arange(300) % len(corners), 0]
+    distance, row, foot = TriangleTree(corners).nearest(points)
+    if kind == "empty":  # where libigl is wrong
+        wanted = np.min([to_segments(points, corners[:, i], corners[:, i - 1]) for i in range(3)], axis=0)
+    else:
+        vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+        wanted = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0])
+    np.testing.assert_allclose(distance, wanted, atol=2e-7 if kind == "thin" else 1e-14)
+    np.testing.assert_allclose(np.linalg.norm(points - foot, axis=1), distance, atol=1e-15)
+    alone = [TriangleTree(corners[[r]]).nearest(points[[i]])[0][0] for i, r in enumerate(row)]
+    assert np.array_equal(alone, distance)
 
 
 def test_rays_from_the_faces_see_what_rays_at_the_faces_see():

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from sdfhub.geometry.morton import morton_order
 from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.triangle_tree import TriangleTree
 from sdfhub.shapes import Mesh, NormalizedMesh
 from sdfhub.triangles import face_normals, piece_count
 
@@ -161,7 +162,7 @@ def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, An
 def point_to_surface(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Exact unsigned distance [N] from each of the points [N, 3] to the nearest point of any face."""
     order, distance = morton_order(points), np.empty(len(points))
-    distance[order] = np.sqrt(igl.point_mesh_squared_distance(points[order], vertices, faces)[0])
+    distance[order] = TriangleTree(vertices[faces]).nearest(points[order])[0]
     return distance
 
 

@@ -13,13 +13,14 @@ from scipy.spatial import cKDTree
 from sdfhub.data.preparation.visibility import Surface
 from sdfhub.geometry.morton import morton_codes, morton_order
 from sdfhub.geometry.surface_sampling import points_on_faces, random_faces
+from sdfhub.geometry.triangle_tree import TriangleTree
 from sdfhub.triangles import face_normals
 
 VOTES, VOTERS = 11, 250_000  # neighbours that vote, of how many visible points (DeepSDF's code)
 INNER = 0.95  # part of the radius of an empty ball whose points take the winding number of its centre
 CLEAR = 0.1  # distance of a winding number from a whole one below which other points may take it
 ROUGH, CLOSE = 1.0, 2.0  # radii from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3), 0.01
-NEAREST_EDGE, WINDING_EDGE = 0.25, 0.1  # above these faces are cut before a tree is built over them
+WINDING_EDGE = 0.1  # above it faces are cut before a tree is built over them
 ROOM = 50_000  # pieces that cutting may add: it pays where few triangles are long
 
 
@@ -44,11 +45,7 @@ SignMethod = Callable[[np.ndarray, Nearest, Surface, np.random.Generator], Signs
 
 def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
     """Exact unsigned distances to all faces of points [N, 3] float64; fastest in `morton_order`."""
-    vertices, faces, source = cut_long(surface.vertices, surface.faces, NEAREST_EDGE)
-    tree = igl.AABB()
-    tree.init(vertices, faces)
-    squared, face, foot = tree.squared_distance(vertices, faces, points)
-    return Nearest(np.sqrt(squared), source[face], foot)
+    return Nearest(*TriangleTree(surface.vertices[surface.faces]).nearest(points))
 
 
 def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator) -> Signs:
