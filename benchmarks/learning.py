@@ -1,0 +1,73 @@
+"""What optimisers, samples and losses do to known and to unseen shapes, by steps and seconds of training.
+
+    python benchmarks/learning.py [--scale cpu] [--category lamps] [--ways adam muon] [overrides for all]
+
+Trains each way side by side with equal seeds and shapes, for shares of the scale's epochs (`--shares`), each
+with a schedule of its own. Prints the excess CD times 10^3 of training and of held-out shapes, and how many
+of these have floating pieces: more connected pieces than the true mesh.
+"""
+
+import argparse
+
+import yaml
+from runs import OUTPUTS, ROOT, head, row, train
+
+from sdfhub.data.preparation.sampling import normalize_mesh
+from sdfhub.procedural import generate
+from sdfhub.triangles import piece_count
+
+FAR = ["loss.far_weight=5", "data.preparation.near_share=0.8"]
+DECOYS = ["data.preparation.decoy_share=0.1"]
+WAYS = {
+    "adam": [],
+    "adam, decoys": DECOYS,
+    "adam, far": FAR,
+    "muon": ["optimizer=muon"],
+    "muon, decoys": ["optimizer=muon", *DECOYS],
+    "muon, far": ["optimizer=muon", *FAR],
+    "muon, decoys, far": ["optimizer=muon", *DECOYS, *FAR],
+    "muon, rotated": ["optimizer=muon", "encoding=rotated"],
+}
+
+
+def floating(shapes: list[dict]) -> str:
+    """How many reconstructions have more pieces than the true mesh, of how many that have a surface."""
+    found = [shape for shape in shapes if not shape["failed"]]
+    more = 0
+    for shape in found:
+        category, index = shape["id"].split("/")
+        mesh = normalize_mesh(*generate(category, int(index)))
+        more += shape["pieces"] > piece_count(mesh.faces, len(mesh.vertices))
+    return f"{more} of {len(found)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scale", default="cpu")
+    parser.add_argument("--category", default="chairs")
+    parser.add_argument("--experiment", default="fft_siren")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=["adam", "muon", "muon, decoys, far"])
+    parser.add_argument("--shares", nargs="+", type=float, default=[1.0], help="of the scale's epochs")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("overrides", nargs="*")
+    args = parser.parse_args()
+    epochs = yaml.safe_load((ROOT / "conf/scale" / f"{args.scale}.yaml").read_text())["trainer"]["max_epochs"]
+    scores = "known, mean | median | unseen, mean | median | floating pieces"
+    head(f"training | seed | steps | s | {scores}")
+    for share in args.shares:
+        for seed in range(args.seeds):
+            for way in args.ways:
+                words = [f"scale={args.scale}", f"experiment={args.experiment}", f"category={args.category}"]
+                words += [f"seed={seed}", f"trainer.max_epochs={max(1, round(share * epochs))}"]
+                name = f"learning_{way.replace(', ', '_')}"
+                found = train(name, *words, "callbacks=none", *WAYS[way], *args.overrides)
+                cells = [found["training"]["steps"], f"{found['training']['seconds']:.0f}"]
+                for role in ("train", "held_out"):
+                    excess = found[role]["summary"]["excess"]
+                    cells += [f"{excess[name] * 1e3:.4f}" for name in ("mean", "median")]
+                row(way, seed, *cells, floating(found["held_out"]["shapes"]))
+    print(f"\nthe last training of each way: {OUTPUTS}/learning_*")
+
+
+if __name__ == "__main__":
+    main()
