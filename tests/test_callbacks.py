@@ -162,6 +162,15 @@ def test_a_checkpoint_of_the_best_val_cd_is_kept(tmp_path):
     assert float(best.best_model_score) < 100 and read_checkpoint(tmp_path / "best.ckpt")
 
 
+def test_averaged_weights_are_what_a_training_ends_with():
+    node = composed("callbacks=ema")["callbacks"]["ema"]
+    trained(instantiate(node, decay=0.5), model=(model := BallModel(0.0, rate=0.01)), max_epochs=1)
+    average = 0.01  # after the first of six steps
+    for step in range(2, 7):
+        average = 0.5 * average + 0.5 * 0.01 * step
+    assert model.decoder.offset.item() == pytest.approx(average)
+
+
 def test_fast_dev_run_leaves_no_checkpoint(tmp_path):
     parts = composed("hydra.runtime.output_dir=" + str(tmp_path))["callbacks"]
     callbacks = [instantiate(parts[name]) for name in ("checkpoint", "snapshots", "stop_on_signal")]

@@ -1,9 +1,31 @@
 """Muon: steps of a matrix along the nearest orthogonal one, so that no direction of it lags behind."""
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+from torch import Tensor
+
+QUINTIC = (3.4445, -4.7750, 2.0315)  # a x + b x^3 + c x^5: five times, singular values come to .7 to 1.2
+ITERATIONS = 5
+
+
+def orthogonalized(matrix: Tensor) -> Tensor:
+    """U p(S) V^T of a matrix U S V^T [M, N], with all of p(S) near 1, by Newton-Schulz iterations.
+
+    On a CPU in float32: without instructions for bfloat16, PyTorch's own takes twenty times as long.
+
+    Source: Jordan et al. 2024 (Muon).
+    """
+    a, b, c = QUINTIC
+    x = matrix if matrix.is_cpu else matrix.bfloat16()
+    x = x.T if len(x) > x.shape[1] else x
+    x = x / x.norm().clamp(min=1e-7)
+    for _ in range(ITERATIONS):
+        square = x @ x.T
+        x = torch.addmm(x, torch.addmm(square, square, square, beta=b, alpha=c), x, beta=a)
+    return (x.T if len(matrix) > matrix.shape[1] else x).to(matrix.dtype)
 
 
 class Muon(torch.optim.Optimizer):
@@ -31,17 +53,10 @@ class Muon(torch.optim.Optimizer):
         momentum: float = 0.95,
         betas: tuple[float, float] = (0.9, 0.999),
     ):
-        groups = [{"matrices": False} | group for group in params]
-        of_matrices: dict[str, Any] = {"weight_decay": 0.0, "momentum": momentum}
-        of_matrices["adjust_lr_fn"] = "match_rms_adamw"
-        matrices = [group for group in groups if group["matrices"]]
+        groups = [{"matrices": False, "lr": lr} | group for group in params]
         rest = [group for group in groups if not group["matrices"]]
-        self._inner: dict[bool, torch.optim.Optimizer] = {}  # they fill in what a group does not say
-        if matrices:
-            self._inner[True] = torch.optim.Muon(matrices, lr=lr, **of_matrices)
-        if rest:
-            self._inner[False] = torch.optim.Adam(rest, lr=lr, betas=betas, fused=True)
-        super().__init__(groups, {})
+        self._adam = torch.optim.Adam(rest, betas=betas, fused=True)  # fills in what its groups do not say
+        super().__init__(groups, {"momentum": momentum})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -49,9 +64,18 @@ class Muon(torch.optim.Optimizer):
         if closure:
             with torch.enable_grad():
                 loss = closure()
-        for is_of_matrices, optimizer in self._inner.items():
-            # both were replaced where a checkpoint was loaded
-            groups = [group for group in self.param_groups if group["matrices"] == is_of_matrices]
-            optimizer.param_groups, optimizer.state = groups, self.state
-            optimizer.step()
+        # a loaded checkpoint has replaced both
+        self._adam.param_groups = [group for group in self.param_groups if not group["matrices"]]
+        self._adam.state = self.state
+        self._adam.step()
+        for group in self.param_groups:
+            for matrix in group["params"] if group["matrices"] else ():
+                if matrix.grad is not None:
+                    self._step(matrix, group["lr"], group["momentum"])
         return loss
+
+    def _step(self, matrix: Tensor, lr: float, momentum: float) -> None:
+        state = self.state[matrix]
+        mean = state.setdefault("momentum", torch.zeros_like(matrix)).lerp_(matrix.grad, 1 - momentum)
+        ahead = matrix.grad.lerp(mean, momentum)  # Nesterov's
+        matrix.add_(orthogonalized(ahead), alpha=-lr * 0.2 * math.sqrt(max(matrix.shape)))
