@@ -34,7 +34,8 @@ class GaussNewtonFit:
 
     Starts: the mean of the training codes, draws from their distribution, and the training codes nearest to
     the observation, or, with an unknown pose, the best of its turns with the training code nearest then.
-    Signed samples have DeepSDF's prior, N(0, 1) in every direction, scans the training codes' distribution.
+    Signed samples have DeepSDF's prior, N(0, 1) in every direction, scans the training codes' distribution;
+    they say so much that two starts do, the mean and the nearest code.
     """
 
     samples: PositiveInt = 16384  # signed samples that an observation of a stored shape should hold
@@ -65,14 +66,17 @@ class GaussNewtonFit:
 
             def fit(group: Shapes) -> list[Tensor]:
                 prior = [0 if shape.is_exact else 1 + shape.partial for shape in group]
-                return self._fit(problem, codes, blind, Rows.of(group, self.smallest, prior, codes.device))
+                rows = Rows.of(group, self.smallest, prior, codes.device)
+                few = not any(prior)
+                starts = (blind[:1], min(1, self.nearest)) if few else (blind, self.nearest)
+                return self._fit(problem, codes, *starts, rows)
 
             fitted, residuals, *pose = in_groups(fit, observations, codes.device)
         return Fitted(fitted, residuals, Similarity(*pose) if pose else None)
 
-    def _fit(self, problem: Problem, codes: Tensor, blind: Tensor, rows: Rows) -> list[Tensor]:
+    def _fit(self, problem: Problem, codes: Tensor, blind: Tensor, nearest: int, rows: Rows) -> list[Tensor]:
         """Codes, residuals and, where unknown, poses of B shapes: all starts on few rows, the best on all."""
-        turn, unknowns = self._starts(problem, codes, blind, rows)  # [B, K], [B, K, U]
+        turn, unknowns = self._starts(problem, codes, blind, nearest, rows)  # [B, K], [B, K, U]
         shape = torch.arange(len(turn), device=turn.device)
         damping = torch.full(turn.shape, self.damping).to(unknowns).flatten()
         starts = shape.repeat_interleave(turn.shape[1]), turn.flatten(), unknowns.flatten(0, 1), damping
@@ -90,16 +94,18 @@ class GaussNewtonFit:
             pose = pose._replace(rotation=pose.rotation @ problem.turns[ends.turn])
         return [unknowns[:, : problem.size], residuals, *pose]
 
-    def _starts(self, problem: Problem, codes: Tensor, blind: Tensor, rows: Rows) -> tuple[Tensor, Tensor]:
+    def _starts(
+        self, problem: Problem, codes: Tensor, blind: Tensor, nearest: int, rows: Rows
+    ) -> tuple[Tensor, Tensor]:
         """Turns [B, K] and unknowns [B, K, U] to descend from; `blind` codes are for every shape."""
         if not problem.has_pose:
-            _, near = self._nearest(problem, codes, rows, self.nearest)
+            _, near = self._nearest(problem, codes, rows, nearest)
             starts = torch.cat([blind.expand(len(near), -1, -1), near], 1)
             turn = torch.zeros(starts.shape[:2], dtype=torch.int64, device=codes.device)
             return turn, problem.unknowns(starts)
         pairs = [self._nearest(problem, codes, rows.turned(turn), 1) for turn in problem.turns]
         scores, starts = (torch.cat(part, 1) for part in zip(*pairs, strict=True))  # [B, F], [B, F, L]
-        turn = scores.argsort(1)[:, : len(blind) + self.nearest]
+        turn = scores.argsort(1)[:, : len(blind) + nearest]
         starts = starts.gather(1, turn[..., None].expand(-1, -1, starts.shape[2]))
         return turn, problem.unknowns(starts)
 

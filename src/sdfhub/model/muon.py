@@ -76,6 +76,7 @@ class Muon(torch.optim.Optimizer):
 
     def _step(self, matrix: Tensor, lr: float, momentum: float) -> None:
         state = self.state[matrix]
-        mean = state.setdefault("momentum", torch.zeros_like(matrix)).lerp_(matrix.grad, 1 - momentum)
-        ahead = matrix.grad.lerp(mean, momentum)  # Nesterov's
+        gradient: Tensor = matrix.grad  # type: ignore[assignment]
+        mean = state.setdefault("momentum", torch.zeros_like(matrix)).lerp_(gradient, 1 - momentum)
+        ahead = gradient.lerp(mean, momentum)  # Nesterov's
         matrix.add_(orthogonalized(ahead), alpha=-lr * 0.2 * math.sqrt(max(matrix.shape)))
