@@ -127,6 +127,25 @@ def test_the_loops_take_callers_from_several_threads(several):
     assert torch.get_num_threads() == several
 
 
+def test_what_stands_beside_an_activation_has_gradients_of_its_own():
+    activation, (product, shift) = Hosc(5.0, 3.0, 2.0), products()
+    beside = torch.randn(3, 300, 7, requires_grad=True)
+    by_value, by_slope = torch.randn(3, 300, 27), torch.randn(3, 300, 20)
+
+    def gradients(value, slope, again=False):
+        inputs = product, shift, activation.log_beta, beside
+        found = torch.autograd.grad([value, slope], inputs, [by_value, by_slope], create_graph=again)
+        squares = [part.square().sum() for part in found[:1]]
+        return torch.autograd.grad(squares, [product, shift]) if again else found
+
+    for again in (False, True):
+        value, slope = activation.with_slope(product + shift)
+        plain = gradients(torch.cat([value, beside], dim=-1), slope, again)
+        fast = gradients(*activated(activation, product, shift, sloped=True, beside=beside), again)
+        for have, want in zip(fast, plain, strict=True):
+            assert (have - want).abs().max() < 1e-4 * want.abs().max()
+
+
 def test_the_loops_gradient_can_be_differentiated_again():
     activation = Hosc(5.0, 3.0, 2.0)
     product, shift = products()

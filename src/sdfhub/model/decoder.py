@@ -20,21 +20,27 @@ HEAD_SPREAD = 0.03  # of the initial output for hidden units of size 1: well ins
 
 
 def activated(
-    activation: Activation, product: Tensor, shift: Tensor, dropout: float = 0.0, sloped: bool = False
+    activation: Activation,
+    product: Tensor,
+    shift: Tensor,
+    dropout: float = 0.0,
+    sloped: bool = False,
+    beside: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """a(product + shift) and, where `sloped`, a'(product + shift), [B, N, W] with the dtype of `product`.
+    """[a(product + shift) | beside] and, where `sloped`, a'(product + shift), [B, N, W], with its dtype.
 
-    The shift is float32, [W] or [B, 1, W]; a unit that drops out has no slope either.
+    The shift is float32, [W] or [B, 1, W]; what stands beside, [B, N, F], is what the next layer reads too; a
+    unit that drops out has no slope either.
     """
     if not dropout and waves.fits(activation, product, shift):
-        return waves.wave(activation, product, shift, sloped)
+        return waves.wave(activation, product, shift, sloped, beside)
     x = product + shift
     value, slope = activation.with_slope(x) if sloped else (activation(x), None)
     value, slope = value.to(product.dtype), None if slope is None else slope.to(product.dtype)
     if dropout:
         factors = dropout_factors(value, dropout)
         value, slope = value * factors, None if slope is None else slope * factors
-    return value, slope
+    return value if beside is None else torch.cat([value, beside.to(value.dtype)], dim=-1), slope
 
 
 class Decoder(Described, nn.Module):
@@ -129,9 +135,8 @@ class Decoder(Described, nn.Module):
         inputs, slopes, dropout = encoded, [], self.dropout if self.training else 0.0
         for layer, activation, following in zip(self.layers, self.activations, self.layers[1:], strict=False):
             product, shift = layer(inputs, codes)
-            inputs, slope = activated(activation, product, shift, dropout, sloped)
-            if following.columns[1]:
-                inputs = torch.cat([inputs, encoded.to(inputs.dtype)], dim=-1)
+            beside = encoded if following.columns[1] else None
+            inputs, slope = activated(activation, product, shift, dropout, sloped, beside)
             slopes.append(slope)
         with full_precision(inputs):  # nor distances
             product, shift = self.layers[-1](inputs.to(encoded.dtype), codes)

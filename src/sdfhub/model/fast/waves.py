@@ -51,36 +51,42 @@ def fits(activation: Activation, product: Tensor, shift: Tensor) -> TypeGuard[Si
     )
 
 
-def wave(activation: Siren, product: Tensor, shift: Tensor, sloped: bool) -> tuple[Tensor, Tensor | None]:
-    """a(product + shift) and a', as `activated` in decoder.py, where the activation `fits`."""
-    inputs = product, shift.float(), getattr(activation, "log_beta", None)
+def wave(
+    activation: Siren, product: Tensor, shift: Tensor, sloped: bool, beside: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """[a(product + shift) | beside] and a', as `activated` in decoder.py, where the activation `fits`."""
+    inputs = product, shift.float(), getattr(activation, "log_beta", None), beside
     result = _Wave.apply(*inputs, activation.omega, activation.with_slope, sloped)
     return result if sloped else (result, None)
 
 
 class _Wave(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, product, shift, log_beta, omega: float, plain: Callable, sloped: bool):
+    def forward(ctx, product, shift, log_beta, beside, omega: float, plain: Callable, sloped: bool):
         ctx.omega, ctx.plain = omega, plain
         ctx.save_for_backward(product, shift, log_beta)
-        value = torch.empty_like(product, memory_format=torch.contiguous_format)
-        slope = torch.empty_like(value) if sloped else None
+        width = product.shape[2]
+        value = product.new_empty(*product.shape[:2], width + (0 if beside is None else beside.shape[2]))
+        slope = product.new_empty(product.shape) if sloped else None
+        if beside is not None:
+            value[..., width:] = beside
         _run(_forward, product, shift, log_beta, omega, _flat(value), _flat(slope))
         return (value, slope) if sloped else value
 
     @staticmethod
     def backward(ctx, by_value, by_slope=None):
         product, shift, log_beta = ctx.saved_tensors
-        if torch.is_grad_enabled():  # the gradient is to be differentiated again
-            return *_differentiable(ctx, by_value, by_slope), None, None, None
         width = product.shape[2]
+        by_beside = by_value[..., width:] if ctx.needs_input_grad[3] else None
+        if torch.is_grad_enabled():  # the gradient is to be differentiated again
+            return *_differentiable(ctx, by_value[..., :width], by_slope), by_beside, None, None, None
         by_product = torch.empty_like(product, memory_format=torch.contiguous_format)
         by_shift, by_log_beta = torch.empty(2, _chunks(product), width)
         arrays = map(_flat, (by_value, by_slope, by_product, by_shift, by_log_beta))
         _run(_backward, product, shift, log_beta, ctx.omega, *arrays)
         by_shift = by_shift.view(shift.numel() // width, -1, width).sum(1).view(shift.shape)
         by_beta = None if log_beta is None else by_log_beta.sum()
-        return by_product, by_shift, by_beta, None, None, None
+        return by_product, by_shift, by_beta, by_beside, None, None, None
 
 
 def _differentiable(ctx, *cotangents: Tensor | None) -> list[Tensor | None]:
