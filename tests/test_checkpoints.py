@@ -25,6 +25,15 @@ STEPS, EPOCHS = 4, 3
 CONFIG = composed("decoder.width=16", "decoder.code_size=8", "decoder.dropout=0.1", "optimizer=muon")
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """A forked process has none of OpenMP's threads, and would wait for them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 class At(L.Callback):
     """Does something after a step, as if it came from outside."""
 
