@@ -31,14 +31,14 @@ WAYS = {
 
 
 def floating(shapes: list[dict]) -> str:
-    """How many reconstructions have more pieces than the true mesh, of how many that have a surface."""
+    """How many have more pieces than the true mesh, of how many with a surface, and how many have none."""
     found = [shape for shape in shapes if not shape["failed"]]
     more = 0
     for shape in found:
         category, index = shape["id"].split("/")
         mesh = normalize_mesh(*generate(category, int(index)))
         more += shape["pieces"] > piece_count(mesh.faces, len(mesh.vertices))
-    return f"{more} of {len(found)}"
+    return f"{more} of {len(found)} | {len(shapes) - len(found)}"
 
 
 def main() -> None:
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
     epochs = yaml.safe_load((ROOT / "conf/scale" / f"{args.scale}.yaml").read_text())["trainer"]["max_epochs"]
-    scores = "known, mean | median | unseen, mean | median | floating pieces"
+    scores = "known, mean | median | unseen, mean | median | floating pieces | no surface"
     head(f"training | seed | steps | s | {scores}")
     for share in args.shares:
         for seed in range(args.seeds):

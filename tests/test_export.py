@@ -173,7 +173,7 @@ def test_a_key_that_a_task_does_not_have_is_refused_by_name(run, monkeypatch, ca
     assert told.startswith(message) and "Traceback" not in told
 
 
-@pytest.mark.parametrize("task", ["export", "reconstruct"])
+@pytest.mark.parametrize("task", ["export", "interpolate", "sample", "neighbours", "reconstruct"])
 def test_help_tells_the_tasks_own_keys(task, monkeypatch, capsys):
     assert run_command(monkeypatch, "--help", task=task) == 0
     keys = capsys.readouterr().out.partition("== Config ==")[2].splitlines()

@@ -1,4 +1,4 @@
-"""Exact nearest points of a triangle mesh: a tree of boxes, searched in compiled loops.
+"""Nearest points of a triangle mesh, exact but on slivers: a tree of boxes, searched in compiled loops.
 
 libigl's tree, the plain twin, takes two to three times as long: it knows nothing of the point before.
 """

@@ -25,7 +25,7 @@ def drawn_from(seed: int | None) -> Iterator[None]:
 def dropout_factors(hidden: Tensor, probability: float) -> Tensor:
     """0 with this probability, rounded to 2^-16, else its complement's inverse; like `hidden`.
 
-    On the CPU from 16 random bits a number: PyTorch's own draw takes most of the time of a layer's product.
+    On the CPU from 16 random bits a number: PyTorch's own draw takes several times as long.
     """
     if not hidden.is_cpu or torch.compiler.is_compiling():  # a compiler knows no generators
         return F.dropout(torch.ones_like(hidden), probability)

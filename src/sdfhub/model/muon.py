@@ -14,7 +14,7 @@ ITERATIONS = 5
 def orthogonalized(matrix: Tensor) -> Tensor:
     """U p(S) V^T of a matrix U S V^T [M, N], with all of p(S) near 1, by Newton-Schulz iterations.
 
-    On a CPU in float32: without instructions for bfloat16, PyTorch's own takes twenty times as long.
+    On a CPU in float32: without instructions for bfloat16, PyTorch's own takes far longer.
 
     Source: Jordan et al. 2024 (Muon).
     """

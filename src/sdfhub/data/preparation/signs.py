@@ -59,7 +59,7 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
     points, distance = points[order], nearest.distance[order]
     codes, winding, todo = morton_codes(points), np.empty(len(points)), np.arange(len(points))
     tree = igl.FastWindingNumberBVH()
-    tree.init(*cut_long(surface.vertices, surface.solid(), WINDING_EDGE)[:2], 2)
+    tree.init(*cut_long(surface.vertices, surface.solid(), WINDING_EDGE), 2)
     for level in range(8, 0, -1):  # cells of 3/4 down to 6/1024 a side
         if not len(todo):
             break
@@ -123,8 +123,8 @@ def pseudo_normal_signs(
     Source: Baerentzen and Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal.
     """
     vertices, faces = surface.vertices, surface.faces
-    normals = face_normals(vertices, faces)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    doubled = face_normals(vertices, faces)
+    normals = doubled / np.linalg.norm(doubled, axis=1, keepdims=True)
     edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]  # [F, 3, 3], edge i from corner i
     edges /= np.linalg.norm(edges, axis=2, keepdims=True)
     angles = np.arccos(-np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1)).clip(-1, 1))
@@ -133,7 +133,7 @@ def pseudo_normal_signs(
     of_edges = _sums(edge, np.repeat(normals[:, None], 3, axis=1))
     of_corners = _sums(faces, angles[..., None] * normals[:, None])
     directions = np.concatenate([normals[:, None], of_edges, of_corners], axis=1)  # [F, 7, 3]
-    shares = _barycentric(nearest, vertices[faces])
+    shares = _barycentric(nearest, vertices[faces], doubled)
     on_edge = shares < 1e-6
     part = np.where(on_edge.any(axis=1), 1 + (shares.argmin(axis=1) + 1) % 3, 0)  # the edge opposite
     part = np.where(on_edge.sum(axis=1) > 1, 4 + shares.argmax(axis=1), part)
@@ -148,24 +148,22 @@ def _sums(rows: np.ndarray, parts: np.ndarray) -> np.ndarray:
     return np.stack(sums, axis=1)[rows].reshape(parts.shape)
 
 
-def _barycentric(nearest: Nearest, corners: np.ndarray) -> np.ndarray:
-    """[N, 3] coordinates of the feet in their triangles [F, 3, 3], those of each corner."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.sum(normals**2, axis=1, keepdims=True)
+def _barycentric(nearest: Nearest, corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """[N, 3] coordinates of the feet in their triangles [F, 3, 3], which have `face_normals` [F, 3]."""
+    normals = normals / np.sum(normals**2, axis=1, keepdims=True)
     opposite = [np.cross(normals, corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3]) for i in range(3)]
     slopes, at = np.stack(opposite, axis=1), corners[:, [1, 2, 0]]
     offsets = np.einsum("fij,fij->fi", slopes, at)
     return np.einsum("nij,nj->ni", slopes[nearest.face], nearest.foot) - offsets[nearest.face]
 
 
-def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
+def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Triangles halved across their longest edge until none is longer than `longest`, or ROOM is used up.
 
-    The long thin triangles of a chair's legs make trees of boxes, and fast winding numbers, visit nearly all.
-    Returns vertices [V + M, 3], faces [F + M, 3], and the rows [F + M] of the faces that these are pieces of.
+    The long thin triangles of a chair's legs make fast winding numbers visit nearly all.
+    Returns vertices [V + M, 3] and faces [F + M, 3].
     """
-    source, left = np.arange(len(faces)), np.arange(len(faces))
-    room = ROOM
+    left, room = np.arange(len(faces)), ROOM
     while len(left):
         corners = vertices[faces[left]]
         squared = np.sum((np.roll(corners, -1, axis=1) - corners) ** 2, axis=2)
@@ -178,10 +176,10 @@ def cut_long(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[n
         middle = len(vertices) + np.arange(len(left))
         vertices = np.concatenate([vertices, (vertices[a] + vertices[b]) / 2])
         first, second = np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
-        faces, source = np.concatenate([faces, second]), np.concatenate([source, source[left]])
+        faces = np.concatenate([faces, second])
         faces[left] = first
         left = np.concatenate([left, np.arange(len(faces) - len(left), len(faces))])
-    return vertices, faces, source
+    return vertices, faces
 
 
 SIGN_METHODS: dict[str, SignMethod]
