@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +26,8 @@ from runs import ROOT, head, row
 
 from sdfhub.data.preparation.sampling import normalize_mesh
 from sdfhub.data.workers import map_in_processes
-from sdfhub.geometry.metrics import chamfer, judge_pair
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.metrics import chamfer, judge
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.procedural import generate
 from sdfhub.shapes import Mesh, NormalizedMesh
 
@@ -61,7 +60,7 @@ def time_chamfer(count: int) -> None:
 def time_judge(count: int) -> None:
     ready = list(pairs(count))
     for workers in (0, os.cpu_count()):
-        stream = map_in_processes(partial(judge_pair, points=30_000, seed=0), ready, workers)
+        stream = map_in_processes(lambda pair: judge(*pair), ready, workers)
         next(stream)  # processes have started
         start, at = time.perf_counter(), time.process_time()
         judged = len(list(stream))

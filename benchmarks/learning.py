@@ -13,8 +13,8 @@ import yaml
 from runs import OUTPUTS, ROOT, head, row, train
 
 from sdfhub.data.preparation.sampling import normalize_mesh
+from sdfhub.geometry.surface import piece_count
 from sdfhub.procedural import generate
-from sdfhub.triangles import piece_count
 
 FAR = ["loss.far_weight=5", "data.preparation.near_share=0.8"]
 DECOYS = ["data.preparation.decoy_share=0.1"]

@@ -23,12 +23,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from dense_meshing import mesh_dense
 from runs import OUTPUTS, head, row, train
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sdfhub.geometry.mesher import mesh_dense, mesh_field
+from sdfhub.geometry.mesher import mesh_field
 from sdfhub.model.autodecoder import AutoDecoder
 from sdfhub.model.saved import built_parts
 

@@ -16,7 +16,7 @@ from runs import head, row
 from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.report.pictures import reconstruction
 from sdfhub.report.results import Cell, PlannedCell, ShapeScore, read_scores
 from sdfhub.tasks.report import truth_finder

@@ -39,7 +39,7 @@ from sdfhub.data.splits import split
 from sdfhub.data.store.store import prepare, shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.geometry.metrics import judge, point_to_surface
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.opening import data_of, read_run
 from sdfhub.reconstruction.reconstructor import Limits, Reconstructor, Result
 from sdfhub.scans.observed_scan import ObservedScan, observe

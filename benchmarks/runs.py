@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sdfhub.locks import locked
+from sdfhub.whole_file import locked
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = ROOT / "outputs" / "benchmarks"

@@ -19,7 +19,7 @@ import sdfhub
 from sdfhub.data.sources import ProceduralSource
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.opening import data_of
 from sdfhub.procedural import generate
 from sdfhub.shapes import RADIUS

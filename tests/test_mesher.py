@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from dense_meshing import mesh_dense
 from scipy.spatial import cKDTree
 
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry import coarse_to_fine, mesher
 from sdfhub.geometry.coarse_to_fine import SampledCells, sample_blocks
 from sdfhub.geometry.grid import Grid
-from sdfhub.geometry.mesher import mesh_dense, mesh_field, mesh_fields, sdf_slice
+from sdfhub.geometry.mesher import mesh_field, mesh_fields, sdf_slice
 from sdfhub.geometry.metrics import is_closed
 
 RADIUS = 0.6

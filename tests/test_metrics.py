@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from dense_meshing import mesh_dense
 
-from sdfhub.geometry.mesher import mesh_dense
 from sdfhub.geometry.metrics import chamfer, is_closed, judge, point_to_surface, summarize, volumetric_iou
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.shapes import Frame, NormalizedMesh
 
 EMPTY = np.empty((0, 3)), np.empty((0, 3), np.int64)

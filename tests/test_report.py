@@ -22,13 +22,13 @@ from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import locked
 from sdfhub.report.pictures import ShownMesh, contact_sheet_of, loss_chart, packed, reconstruction
 from sdfhub.report.results import PLAN, ShapeScore, enter_cells, read_plan, read_sweep
 from sdfhub.report.rows import group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import latex, markdown, origin, overview, tables
 from sdfhub.tasks import report as report_task
 from sdfhub.tasks.report import sheet_name, write_report
+from sdfhub.whole_file import locked
 from tests.sweep_folders import planned, score, write_cell, write_mesh
 from tests.tiny import run_command
 

@@ -10,9 +10,8 @@ from sdfhub.data.preparation.settings import Preparation
 from sdfhub.data.preparation.signs import ROOM, SIGN_METHODS, cut_long, nearest_points, winding_signs
 from sdfhub.data.preparation.visibility import closed_surface, sightings, visible_surface
 from sdfhub.geometry.morton import morton_order
-from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
+from sdfhub.geometry.surface import face_normals, points_on_faces, sphere_directions
 from sdfhub.geometry.triangle_tree import TriangleTree
-from sdfhub.triangles import face_normals
 from tests.broken_twins import chair_parts, punctured, refined, ring, signed_distance, triangles
 
 CHAIR = triangles(refined(Manifold.batch_boolean(chair_parts(), OpType.Add)))

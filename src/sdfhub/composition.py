@@ -68,14 +68,10 @@ def drop_replaced(config: DictConfig, words: Sequence[str]) -> None:
 
 
 def _check(node: Any, key: str, given: Mapping[str, Any] | None = None) -> None:
-    if isinstance(node, list):
-        for number, item in enumerate(node):
-            _check(item, f"{key}.{number}")
-    if not isinstance(node, Mapping):
-        return
-    for name, value in node.items():
-        _check(value, f"{key}.{name}")
-    if "_target_" in node and "_args_" not in node:
+    is_mapping = isinstance(node, Mapping)
+    for name, item in node.items() if is_mapping else enumerate(node if isinstance(node, list) else ()):
+        _check(item, f"{key}.{name}")
+    if is_mapping and "_target_" in node and "_args_" not in node:
         arguments = {name: value for name, value in node.items() if name not in RESERVED}
         check_arguments(located(node["_target_"], key), {**arguments, **(given or {})}, key)
 

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from sdfhub.checkpoint_file import LAST, read_checkpoint
 from sdfhub.described import built
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import saved_decoder
-from sdfhub.shapes import Frame
+from sdfhub.shapes import Frame, UpAxis
 from sdfhub.space import Space
 from sdfhub.whole_file import write_whole
 
@@ -82,12 +82,7 @@ def _plain_frames(frames: Mapping[str, Frame]) -> dict[str, list[float]]:
 
 
 def begin_run(
-    run: Path,
-    config: dict[str, Any],
-    train: Ids,
-    held_out: Ids,
-    frames: Mapping[str, Frame],
-    up: Literal["y", "z"],
+    run: Path, config: dict[str, Any], train: Ids, held_out: Ids, frames: Mapping[str, Frame], up: UpAxis
 ) -> None:
     """Writes down what a run is made of, before it starts; scores of what lay there before go."""
     (run / "metrics.json").unlink(missing_ok=True)  # else an interrupted run would pass for a finished one
@@ -136,11 +131,9 @@ def beside(run: str, out: str | None, name: str) -> Path:
 
 def _of_run(run: Path) -> tuple[dict[str, Any], dict[str, Tensor], Tensor]:
     config, split = read_run(run)
-    checkpoint, frames, metrics = run / "checkpoints" / LAST, run / "frames.json", run / "metrics.json"
-    content = read_checkpoint(checkpoint)
-    weights = content.get("state_dict") if isinstance(content, dict) else None
-    if not isinstance(weights, dict) or getattr(weights.get("codes.table"), "ndim", 0) != 2:
-        raise SdfhubError(f"{checkpoint}: not a checkpoint of an auto-decoder")
+    content = read_checkpoint(run / "checkpoints" / LAST)
+    frames, metrics = run / "frames.json", run / "metrics.json"
+    weights = dict(content["state_dict"])
     codes = weights.pop("codes.table")
     weights = {name.removeprefix("decoder."): weight for name, weight in weights.items()}
     about: dict[str, Any] = {"model": content["hyper_parameters"], "config": config, "ids": split["train"]}

@@ -123,10 +123,7 @@ class ShapeSamples:
         arrays = self.points, self.sdf, self.surface_points, self.surface_normals
         if not all(np.isfinite(array).all() for array in arrays):
             raise ValueError("samples: all must be finite")
-        if (
-            len(self.surface_normals)
-            and np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max() > 1e-3
-        ):
+        if np.abs(np.linalg.norm(self.surface_normals, axis=1) - 1).max(initial=0) > 1e-3:
             raise ValueError("surface_normals: must have unit length")
 
 
@@ -148,9 +145,8 @@ class Observation:
     def __post_init__(self) -> None:
         bound = ("N", np.float32)
         _check(self, points=("N", 3, np.float32), low=bound, high=bound, unsigned=("N", np.bool_))
-        if not len(self.points) or not all(
-            np.isfinite(part).all() for part in (self.points, self.low, self.high)
-        ):
+        arrays = self.points, self.low, self.high
+        if not len(self.points) or not all(np.isfinite(array).all() for array in arrays):
             raise ValueError("points, low and high: must be finite, at least one")
         if (self.low > self.high).any() or not 0 <= self.noise < np.inf:
             raise ValueError("low must not lie above high, noise must be a number >= 0")
@@ -164,8 +160,7 @@ class Observation:
     @property
     def is_exact(self) -> bool:
         """Whether all distances are known, inside too: signed samples."""
-        is_known = not self.unsigned.any() and bool((self.low == self.high).all())
-        return is_known and bool(self.low.min() < 0)
+        return not self.unsigned.any() and np.array_equal(self.low, self.high) and bool(self.low.min() < 0)
 
 
 @dataclass(frozen=True)

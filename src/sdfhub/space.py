@@ -245,10 +245,7 @@ def _numbers(array: Any) -> Any:
 def reconstruct(decoder: Decoder, codes: Tensor, resolution: int) -> Iterator[Mesh]:
     """The zero levels of f(., z) of codes [S, L], normalised frame, meshed together; empty without one."""
     _check_count("resolution", resolution, 2)
-
-    def fields(points: Tensor, shapes: Tensor) -> Tensor:
-        return distances(decoder, points, codes[shapes])
-
+    fields = lambda points, shapes: distances(decoder, points, codes[shapes])  # noqa: E731
     try:
         yield from mesh_fields(fields, len(codes), resolution, device=codes.device)
     except MemoryError as error:

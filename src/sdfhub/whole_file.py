@@ -1,6 +1,7 @@
-"""Files that are there whole or not at all, however their writer ends, and their checksums."""
+"""Files that are there whole or not at all, however their writer ends; their checksums and locks."""
 
 import hashlib
+import logging
 import os
 import tempfile
 import uuid
@@ -9,7 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from filelock import FileLock, Timeout
+
 from sdfhub.errors import SdfhubError
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -56,3 +61,16 @@ def file_sha256(path: Path) -> str:
     """Hex sha256 of a file's content."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def locked(path: Path, waiting: str = "") -> Iterator[None]:
+    """Holds a lock file, which the system frees however its holder ends; logs `waiting` if it must wait."""
+    try:
+        held = FileLock(path).acquire(timeout=0)
+    except Timeout:
+        if waiting:
+            log.info(waiting)
+        held = FileLock(path).acquire(poll_interval=0.1)
+    with held:
+        yield

@@ -68,9 +68,7 @@ class MeshShapes(ShapesShown):
     counts points along an axis of the marching-cubes grid, `points` those a side of the Chamfer distance.
     """
 
-    def __init__(
-        self, times: Count = 8, shapes: Count = 2, resolution: GridSize = 96, points: Count = 10_000
-    ):
+    def __init__(self, times: Count = 8, shapes: Count = 2, resolution: GridSize = 96, points: Count = 10000):
         super().__init__(times, shapes)
         self.resolution, self.points = resolution, points
         self._truth_pictures: dict[str, np.ndarray] = {}  # of the shapes whose true mesh was shown
@@ -85,9 +83,7 @@ class MeshShapes(ShapesShown):
         for logger in trainer.loggers:  # not self.log, which drops what lies between two log_every_n_steps
             logger.log_metrics(values, trainer.global_step)
 
-    def _show_shape(
-        self, trainer: L.Trainer, module: Any, shape: Any, code: Tensor, truth: Any
-    ) -> ShapeMetrics:
+    def _show_shape(self, trainer: Any, module: Any, shape: Any, code: Tensor, truth: Any) -> ShapeMetrics:
         try:
             mesh = next(reconstruct(module.decoder, code[None], self.resolution))
         except SdfhubError:  # the field is not finite: the loss will say so, with a hint

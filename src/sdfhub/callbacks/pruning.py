@@ -1,6 +1,5 @@
 """Trainings of an Optuna search that are not promising end early."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import lightning as L
@@ -20,12 +19,7 @@ class OptunaPruning(L.Callback):
     """
 
     def __init__(
-        self,
-        storage: str,
-        study: str,
-        overrides: Sequence[str],
-        pruner: "BasePruner",
-        monitor: str = "val/cd",
+        self, storage: str, study: str, overrides: list[str], pruner: "BasePruner", monitor: str = "val/cd"
     ):
         self.storage, self.study, self.overrides = storage, study, set(overrides)
         self.pruner, self.monitor = pruner, monitor

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import locked
+from sdfhub.whole_file import locked
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,6 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -21,7 +20,7 @@ from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.scoresheet import Judged, write_scores
 from sdfhub.geometry.mesh_file import write_mesh
-from sdfhub.geometry.metrics import DistanceMetrics, judge_pair
+from sdfhub.geometry.metrics import DistanceMetrics, judge
 from sdfhub.geometry.render import render
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
@@ -116,7 +115,7 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
-    judge_one = partial(judge_pair, points=evaluation.points, seed=evaluation.seed)
+    judge_one = lambda pair: judge(*pair, evaluation.points, evaluation.seed)  # noqa: E731
     judged = dict(map_in_processes(judge_one, pairs(), workers))
     metrics = [judged[index] for index in range(len(roles))]
     if any(isinstance(row, Crashed) for row in metrics):

@@ -11,7 +11,7 @@ from torch import Tensor
 from sdfhub.data.store.stored_shape import signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.latent.fitting import Fit
 from sdfhub.model.decoder import Decoder
 from sdfhub.model.fast.computing import distances

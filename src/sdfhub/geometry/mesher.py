@@ -1,4 +1,4 @@
-"""From fields to meshes: marching cubes at the zero level, dense or coarse to fine, one shape or many.
+"""From fields to meshes: marching cubes at the zero level, coarse to fine, one shape or many.
 
 Source: Lewiner et al., Efficient Implementation of Marching Cubes' Cases with Topological Guarantees, 2003
 (the triangles of a cell; scikit-image's implementation).
@@ -18,7 +18,6 @@ from sdfhub.shapes import Mesh
 Field = Callable[[torch.Tensor], torch.Tensor]  # points [N, 3] float32 -> signed distances [N]
 
 Device = torch.device | str
-_EMPTY = np.empty((0, 3), np.float32), np.empty((0, 3), np.int32)
 _NODES_TOGETHER = 2**26  # nodes of all shapes that are meshed together, at one byte each; or one shape
 _CACHED, _LARGE = 2**13, 2**20  # points per call: what the cache of one core keeps; what fills a GPU
 
@@ -29,8 +28,8 @@ def mesh_fields(
     """The zero levels of many fields as triangle meshes, evaluated coarse to fine, level by level together.
 
     `fields` is asked for shapes 0 ... shapes - 1 on `device`, in any order and repeated, for `batch` points a
-    call (None chooses by device). A mesh equals that of `mesh_dense` but for connected pieces of surface that
-    lie wholly in skipped cells; it is open where the surface leaves the cube, empty where there is none.
+    call (None chooses by device). A mesh equals that of the whole grid but for connected pieces of surface
+    wholly in skipped cells; it is open where the surface leaves the cube, empty where there is none.
     """
     nodes = resolution**3
     together = max(1, _NODES_TOGETHER // nodes)
@@ -47,15 +46,6 @@ def mesh_fields(
 def mesh_field(field: Field, resolution: int = 256, device: Device = "cpu") -> Mesh:
     """The zero level of one field, which takes points [N, 3] alone: `mesh_fields` of one shape."""
     return next(mesh_fields(_as_fields(field), 1, resolution, device=device))
-
-
-def mesh_dense(field: Field, resolution: int = 256, device: Device = "cpu") -> Mesh:
-    """The zero level of one field, every node of the grid evaluated: the plain twin of `mesh_field`."""
-    grid, nodes = _grid(_as_fields(field), range(1), resolution, None, device), resolution**3
-    keys = (np.arange(start, min(start + _LARGE, nodes)) for start in range(0, nodes, _LARGE))
-    values = np.concatenate([grid.evaluate(part) for part in keys])
-    has_surface, volume = values.min() <= 0 < values.max(), values.reshape((resolution,) * 3)
-    return grid.to_frame(*(marching_cubes(volume, 0.0)[:2] if has_surface else _EMPTY))
 
 
 def sdf_slice(
@@ -86,7 +76,7 @@ def _as_fields(field: Field) -> Fields:
 def _march_cells(cells: np.ndarray, nodes: np.ndarray, values: np.ndarray, n: int) -> tuple[Any, Any]:
     """Vertices in grid steps and faces of cells [M], keys of lowest nodes, from values [K] at nodes [K]."""
     if not len(cells):
-        return _EMPTY
+        return np.empty((0, 3)), np.empty((0, 3))
     cells, nodes = np.stack(indices(cells, n)), np.stack(indices(nodes, n))
     low, high = cells.min(axis=1), cells.max(axis=1) + 1  # only the box of the cells is marched
     is_within = np.logical_and.reduce((nodes >= low[:, None]) & (nodes <= high[:, None]))

@@ -5,25 +5,23 @@ distances in their squares; nothing is multiplied by 10^3 here. Two samplings of
 *noise floor*, which grows with area and falls with the number of points.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from typing import Any
 
 import igl
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from sdfhub.geometry.morton import morton_order
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import face_normals, piece_count, sample_surface
 from sdfhub.geometry.triangle_tree import TriangleTree
 from sdfhub.shapes import Mesh, NormalizedMesh
-from sdfhub.triangles import face_normals, piece_count
 
-STATISTICS: dict[str, Callable[..., Any]] = {
-    "mean": np.mean,
-    "median": np.median,
-    "p90": lambda x: np.percentile(x, 90),
-}
+TAU = 0.01  # distance within which a sample counts for the F-score
+STATISTICS: dict[str, Any] = {"mean": np.mean, "median": np.median, "p90": partial(np.percentile, q=90)}
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class ShapeMetrics:
     completeness: float | None  # the same from the truth's samples to the reconstructed surface
     completeness_p95: float | None
     normal_consistency: float | None  # mean |n . n'| of nearest samples, both directions averaged, in [0, 1]
-    f_score: float | None  # harmonic mean of the shares of samples within tau of the other surface
+    f_score: float | None  # harmonic mean of the shares of samples within TAU of the other surface
     iou: float | None  # volume of the intersection over that of the union; None unless both meshes are closed
     cd_penalty: float  # `cd` of a single point at the origin, which stands for a failed reconstruction
     failed: bool  # no surface: everything but `floor`, `cd_penalty` and the counts is None then
@@ -49,10 +47,8 @@ class ShapeMetrics:
     pieces: int  # connected, crumbs among them
 
 
-def judge(
-    reconstruction: Mesh, truth: NormalizedMesh, points: int = 30_000, seed: int = 0, tau: float = 0.01
-) -> ShapeMetrics:
-    """All metrics of a reconstruction, normalised frame, by `points` samples a side; tau: of the F-score."""
+def judge(reconstruction: Mesh, truth: NormalizedMesh, points: int = 30_000, seed: int = 0) -> ShapeMetrics:
+    """All metrics of a reconstruction, normalised frame, by `points` samples a side."""
     mesh = Mesh(*map(np.ascontiguousarray, reconstruction, (np.float64, np.int64)))
     true_mesh = Mesh(truth.vertices, truth.faces)
     expected, true_normals = sample_surface(*true_mesh, points, (seed, 0))
@@ -78,15 +74,10 @@ def judge(
     to_truth, to_mesh = point_to_surface(samples, *true_mesh), point_to_surface(expected, *mesh)
     for name, distances in (("accuracy", to_truth), ("completeness", to_mesh)):
         values |= {name: float(distances.mean()), f"{name}_p95": float(np.percentile(distances, 95))}
-    precision, recall = float(np.mean(to_truth < tau)), float(np.mean(to_mesh < tau))
+    precision, recall = float(np.mean(to_truth < TAU)), float(np.mean(to_mesh < TAU))
     values["point_to_surface"] = (values["accuracy"] + values["completeness"]) / 2
     values["f_score"] = 2 * precision * recall / max(precision + recall, 1e-12)
     return ShapeMetrics(**values)
-
-
-def judge_pair(pair: tuple[Mesh, NormalizedMesh], points: int, seed: int) -> ShapeMetrics:
-    """`judge` of a reconstruction and its truth, for streams of such pairs."""
-    return judge(*pair, points, seed)
 
 
 def chamfer(a: np.ndarray, b: np.ndarray) -> float:
@@ -122,11 +113,9 @@ def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
 
 def _edges_cancel(faces: np.ndarray) -> bool:
-    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-    up, size = start < end, int(faces.max()) + 1
-    rising = np.sort(start[up] * size + end[up])
-    falling = np.sort((end * size + start)[start > end])
-    return np.array_equal(rising, falling)
+    edges = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    uses = csr_array((np.ones(faces.size, np.int32), edges), shape=2 * (faces.max() + 1,))
+    return not (uses - uses.T).count_nonzero()
 
 
 @dataclass(frozen=True)
@@ -142,10 +131,8 @@ def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, An
     summary: dict[str, Any] = {"shapes": len(metrics)}
     rows = [row for row in metrics if isinstance(row, ShapeMetrics)]
     if len(rows) == len(metrics):
-        summary |= {"failed": sum(row.failed for row in rows)}
-        summary["failures"] = (
-            "one point at the origin in the statistics with_failures, left out of all others"
-        )
+        words = "one point at the origin in the statistics with_failures, left out of all others"
+        summary |= {"failed": sum(row.failed for row in rows), "failures": words}
         with_failures = [row.cd_penalty if row.cd is None else row.cd for row in rows]
         for name in ("mean", "median"):
             summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None

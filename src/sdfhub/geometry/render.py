@@ -5,9 +5,8 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sdfhub.geometry.surface_sampling import sphere_directions
+from sdfhub.geometry.surface import face_normals, sphere_directions
 from sdfhub.shapes import UpAxis, turned_up
-from sdfhub.triangles import face_normals
 
 _CLAY = np.array([0.30, 0.46, 0.72])  # surface colour, linear RGB
 _KEY = np.array([-0.45, -0.6, 0.95]) / np.linalg.norm([-0.45, -0.6, 0.95])  # towards the light

@@ -10,8 +10,10 @@ _RAIL = 0.022  # thickness of rails and posts of light backs
 
 def back(chair) -> list[Manifold]:
     """The parts of the chair's backrest, rooted in its seat."""
-    styles = dict(slats=_slats, spindles=_spindles, ladder=_ladder, solid=_solid, hoop=_hoop, panel=_panel)
-    return styles[chair.back](chair)
+    if chair.back in ("solid", "hoop"):
+        return _shell(chair) if chair.back == "solid" else _hoop(chair)
+    between = dict(slats=_slats, spindles=_spindles, ladder=_ladder, panel=_shell)
+    return [*_posts(chair), *between[chair.back](chair)]
 
 
 def point(chair, side: float, height: float) -> np.ndarray:
@@ -71,7 +73,7 @@ def _posts(chair) -> list[Manifold]:
 def _slats(chair) -> list[Manifold]:
     """Flat vertical boards between two rails."""
     low, high = 0.16 * chair.back_height, chair.back_height - 0.03
-    made = [*_posts(chair), _rail(chair, low, 0.035, _RAIL), _rail(chair, high, 0.06, _RAIL + 0.006)]
+    made = [_rail(chair, low, 0.035, _RAIL), _rail(chair, high, 0.06, _RAIL + 0.006)]
     width = min(0.05, 0.9 * chair.seat_width / (chair.slats + 1) * 0.6)
     board, heights = parts.rounded_rectangle(width, 0.014, 0.004), np.linspace(low, high, 5)
     return made + [_upright(chair, side, heights, board) for side in _inner_sides(chair)]
@@ -80,8 +82,7 @@ def _slats(chair) -> list[Manifold]:
 def _spindles(chair) -> list[Manifold]:
     """Turned rods from the seat into a crest rail."""
     high = chair.back_height - 0.02
-    made = [*_posts(chair), _rail(chair, high, 0.075, _RAIL + 0.004, crest=0.025)]
-    return made + _rods(chair, [high] * chair.slats)
+    return [_rail(chair, high, 0.075, _RAIL + 0.004, crest=0.025), *_rods(chair, [high] * chair.slats)]
 
 
 def _ladder(chair) -> list[Manifold]:
@@ -89,28 +90,21 @@ def _ladder(chair) -> list[Manifold]:
     count = max(2, chair.slats - 2)
     heights = np.linspace(0.28, 1, count) * chair.back_height - 0.035
     tall = min(0.07, 0.55 * (heights[1] - heights[0]))
-    return [*_posts(chair), *(_rail(chair, h, tall, 0.02, crest=0.014) for h in heights)]
+    return [_rail(chair, h, tall, 0.02, crest=0.014) for h in heights]
 
 
-def _shell(chair, low: float, thick: float, round_top: float) -> Manifold:
-    """A curved panel between two heights; its upper corners fall by `round_top`."""
-    sections = []
+def _shell(chair) -> list[Manifold]:
+    """A curved board with rounded upper corners, held clear of the seat; a solid one grows out of it."""
+    low, fall = 0.38 * chair.back_height, 0.03
+    if chair.back == "solid":
+        low, fall = -0.4 * chair.seat_thickness, 0.3 * chair.back_height
+    sections, half = [], np.array([0, chair.back_thickness / 2, 0])
     for side in np.linspace(-1.04, 1.04, 17):
-        top = chair.back_height - round_top * np.abs(side / 1.04) ** 6
-        front = [point(chair, side, h) - [0, thick / 2, 0] for h in np.linspace(low, top, 6)]
-        rear = [point(chair, side, h) + [0, thick / 2, 0] for h in np.linspace(top, low, 6)]
+        top = chair.back_height - fall * np.abs(side / 1.04) ** 6
+        front = [point(chair, side, h) - half for h in np.linspace(low, top, 6)]
+        rear = [point(chair, side, h) + half for h in np.linspace(top, low, 6)]
         sections.append(front + rear)
-    return parts.loft(sections)
-
-
-def _solid(chair) -> list[Manifold]:
-    """A curved shell that grows out of the seat."""
-    return [_shell(chair, -0.4 * chair.seat_thickness, chair.back_thickness, 0.3 * chair.back_height)]
-
-
-def _panel(chair) -> list[Manifold]:
-    """A panel held clear of the seat by two posts."""
-    return [*_posts(chair), _shell(chair, 0.38 * chair.back_height, chair.back_thickness, 0.03)]
+    return [parts.loft(sections)]
 
 
 def _hoop(chair) -> list[Manifold]:

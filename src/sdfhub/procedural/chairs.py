@@ -62,12 +62,9 @@ class Chair(SimpleNamespace):
         made = [self._leg(top, foot) for top, foot in ends]
         if self.apron and self.legs != "round":
             z = self.seat_height - self.seat_thickness - 0.045 / 2 + 0.008
-            made += parts.aprons([top for top, _ in ends], z, 0.018, 0.045 + 0.016)
-        if self.stretchers == "none":
-            return made
-        joints = [foot + self.stretcher_height * (top - foot) for top, foot in ends]
+            made += parts.aprons(ends, z, 0.018, 0.045 + 0.016)
         radii = None if self.legs == "square" else (0.009, 0.013)
-        return made + parts.stretchers(joints, self.stretchers, (0.018, 0.026), radii)
+        return made + parts.stretchers(ends, self.stretcher_height, self.stretchers, (0.018, 0.026), radii)
 
     def _leg(self, top: np.ndarray, foot: np.ndarray) -> Manifold:
         w = self.leg_width
@@ -77,7 +74,7 @@ class Chair(SimpleNamespace):
             return parts.bar(foot, top, 0.5 * w * self.leg_taper, 0.55 * w)
         profile = [(0.6, 0), (0.75, 0.03), (0.6, 0.07), (0.5, 0.1), (0.62 + 0.2 * self.leg_taper, 0.3)]
         profile += [(0.95, 0.5), (0.95, 0.56), (0.55, 0.6), (0.9, 0.63), (0.9, 0.65), (0.55, 0.68)]
-        return parts.turned(foot, top, parts.scaled([*profile, (0.95, 0.72), (1, 0.76), (1, 1)], 0.56 * w))
+        return parts.turned(foot, top, [*profile, (0.95, 0.72), (1, 0.76), (1, 1)], 0.56 * w)
 
     def _sled(self) -> list[Manifold]:
         """Two closed loops of tube, one a side, joined by bars under the seat."""

@@ -55,11 +55,9 @@ class Lamp(SimpleNamespace):
         """A floor or table lamp: base, body, stem and a shade on top."""
         low, g = self.tall - self.shade_tall, self.gauge
         made = [lamp_shades.head(self, hung=False).translate((0, 0, low))]
-        if self.base in ("disc", "cube", "feet"):
-            made += [*self._plinth(), parts.rod(0.4 * self.base_height, low, 1.25 * g, 16)]
-        else:
-            made.append(self._body(0.93 * low if self.kind == "table" else 0.4 * low))
-            made.append(parts.rod(0.02, low, 1.25 * g, 16))
+        is_flat = self.base in ("disc", "cube", "feet")
+        made += self._plinth() if is_flat else [self._body(0.93 * low if self.kind == "table" else 0.4 * low)]
+        made.append(parts.rod(0.4 * self.base_height if is_flat else 0.02, low, 1.25 * g, 16))
         if self.collar:
             made.append(parts.ellipsoid((2.4 * g, 2.4 * g, 1.6 * g), (0, 0, 0.93 * low), 18))
         return made
@@ -73,10 +71,10 @@ class Lamp(SimpleNamespace):
         if self.base == "cube":
             return [parts.rounded_box((1.7 * r, 1.7 * r, 1.5 * h), (0, 0, 0.75 * h), 0.1 * h)]
         if self.base == "feet" and self.kind != "arc":
-            made = [parts.rod(0.5 * r, 0.9 * r, 2.2 * g, 16)]
+            made, t = [parts.rod(0.5 * r, 0.9 * r, 2.2 * g, 16)], np.linspace(0, 1, 9)[:, None]
             for way in parts.spokes(3):
                 start, end = 0.8 * r * np.array([0, 0, 1]), 1.25 * r * way + [0, 0, 1.3 * g]
-                path = parts.arc(start, end, 0.22 * r * (way + [0, 0, 1]))
+                path = (1 - t) * start + t * end + 4 * t * (1 - t) * (0.22 * r * (way + [0, 0, 1]))
                 made.append(parts.tube(path, 1.25 * g, up=(-way[1], way[0], 0.0)))
                 made.append(parts.ellipsoid((1.9 * g, 1.9 * g, 1.5 * g), path[-1] + [0, 0, 0.2 * g], 14))
             return made

@@ -43,8 +43,6 @@ def rounded_box(size: Point, centre: Point, radius: float, steps: int = 3) -> Ma
 def pad(outline: np.ndarray, bottom: float, top: float, radius: float, steps: int = 3) -> Manifold:
     """A convex outline [N, 2] extruded with rounded rims; their radius is below half the outline's width."""
     r = min(radius, 0.49 * (top - bottom))
-    if r <= 0:
-        return Manifold.extrude(CrossSection([outline]), top - bottom).translate((0, 0, bottom))
     centre = outline.mean(0)
     reach = np.linalg.norm(outline - centre, axis=1, keepdims=True)
     layers = []
@@ -97,7 +95,7 @@ def tube(path: np.ndarray, radius: float, segments: int = 12, up: Point = (0, 0,
 
 def bar(start: Point, end: Point, radius: float, end_radius: float | None = None) -> Manifold:
     """A straight round bar, tapered from radius to end_radius."""
-    return turned(start, end, [(radius, 0.0), (end_radius or radius, 1.0)], 14)
+    return turned(start, end, [(radius, 0.0), (end_radius or radius, 1.0)], segments=14)
 
 
 def square_bar(start: Point, end: Point, width: float, end_width: float | None = None) -> Manifold:
@@ -113,25 +111,28 @@ def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold
     return sweep(np.array([start, end], float), square * (np.array([thickness, height]) / 2))
 
 
-def turned(start: Point, end: Point, profile: Profile, segments: int = 18) -> Manifold:
-    """A lathe-turned bar: `profile` holds (radius, height), height from 0 at start to 1 at end."""
+def turned(start: Point, end: Point, profile: Profile, radius: float = 1.0, segments: int = 18) -> Manifold:
+    """A lathe-turned bar: `profile` holds (share of radius, height), from 0 at start to 1 at end."""
     start = np.asarray(start, float)
     axis = np.asarray(end, float) - start
     direction = _unit(axis)
     helper = np.array([1.0, 0, 0]) if abs(direction[0]) < 0.9 else np.array([0, 1.0, 0])
     x = _unit(np.cross(helper, direction))
     placed = np.column_stack([x, np.cross(direction, x), axis, start])
-    return lathe(profile, segments, stretch=False).transform(placed)
+    return lathe(profile, segments, radius, stretch=False).transform(placed)
 
 
-def lathe(profile: Profile, segments: int = 24, stretch: bool = True) -> Manifold:
+def lathe(
+    profile: Profile, segments: int = 24, radius: float = 1.0, length: float = 1.0, stretch: bool = True
+) -> Manifold:
     """A solid of revolution around z through a profile from bottom to top, radii > 0.
 
-    `stretch` lets the polygon's area equal the circle's, so that few sides do not shrink it.
+    The profile is in shares of `radius` and `length`. `stretch` lets the polygon's area equal the circle's,
+    so that few sides do not shrink it.
     """
     turn = 2 * np.pi / segments
     ring = circle(segments) * (np.sqrt(turn / np.sin(turn)) if stretch else 1.0)
-    return loft([level(r * ring, z) for r, z in np.asarray(profile, float)])
+    return loft([level(r * ring, z) for r, z in np.asarray(profile, float) * [radius, length]])
 
 
 def revolve_shell(profile: np.ndarray, thickness: float, segments: int = 32) -> Manifold:
@@ -166,13 +167,6 @@ def rounded_rectangle(width: float, depth: float, radius: float, back_width: flo
     return np.vstack(points)
 
 
-def arc(start: Point, end: Point, bulge: Point, count: int = 9) -> np.ndarray:
-    """[count, 3] parabola from start to end whose middle is moved by `bulge`."""
-    t = np.linspace(0, 1, count)[:, None]
-    start, end, bulge = (np.asarray(v, float) for v in (start, end, bulge))
-    return (1 - t) * start + t * end + 4 * t * (1 - t) * bulge
-
-
 def filleted(corners: Sequence[Point] | np.ndarray, radius: float, steps: int = 4) -> np.ndarray:
     """[K, 3] polyline through `corners` with its bends rounded by about `radius`."""
     points = np.asarray(corners, float)
@@ -191,21 +185,21 @@ def spokes(count: int, first: float = -0.5) -> list[np.ndarray]:
     return [np.array([np.cos(angle), np.sin(angle), 0]) for angle in turns]
 
 
-def scaled(profile: Profile, radius: float, length: float = 1.0) -> list:
-    """A profile (radius, height) whose numbers are given in shares of `radius` and `length`."""
-    return [(radius * share, length * along) for share, along in profile]
-
-
-def aprons(tops: Sequence[np.ndarray], height: float, thickness: float, tall: float) -> list[Manifold]:
-    """Boards at `height` between four legs (front left, front right, back left, back right)."""
-    level = [np.array([*top[:2], height]) for top in tops]
+def aprons(ends, height: float, thickness: float, tall: float) -> list[Manifold]:
+    """Boards at `height` between the tops of four legs: front left, front right, back left, back right."""
+    level = [np.array([*top[:2], height]) for top, _ in ends]
     return [plank(level[a], level[b], thickness, tall) for a, b in ((0, 1), (2, 3), (0, 2), (1, 3))]
 
 
-def stretchers(joints: Sequence[np.ndarray], style: str, board: Point, radii: Point | None) -> list[Manifold]:
-    """Bars between four legs: along the sides, and for "h" and "box" also across; turned with `radii` at
-    their ends and in their middle, or `board`s of a thickness and a height."""
-    left, right, rear_left, rear_right = joints
+def stretchers(ends, share: float, style: str, board: Point, radii: Point | None) -> list[Manifold]:
+    """What joins four legs from tops to feet, `ends`, at a share of their height: a "shelf", or bars along
+    the sides, for "h" and "box" also across; turned with `radii` at their ends and in their middle, or
+    `board`s of a thickness and a height."""
+    if style == "none":
+        return []
+    left, right, rear_left, rear_right = (foot + share * (top - foot) for top, foot in ends)
+    if style == "shelf":
+        return [box((*(2 * np.abs(left[:2])), 0.026), (0, 0, left[2]))]
     pairs = [(left, rear_left), (right, rear_right)]
     if style == "h":
         pairs.append(((left + rear_left) / 2, (right + rear_right) / 2))

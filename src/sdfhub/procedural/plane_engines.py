@@ -56,7 +56,7 @@ def _wing_propellers(plane) -> list[Manifold]:
         centre, chord = plane.leading_edge(share) + [0, 0, -0.35 * r], plane.wing_chord(share)
         shape = [(0.62, -0.085), (0.85, -0.075), (1, -0.04)]
         shape += [(1, 0.4 * chord), (0.7, chord), (0.25, 1.3 * chord)]
-        nacelle = pp.body_of_revolution(parts.scaled(shape, r), centre)
+        nacelle = pp.body_of_revolution(shape, centre, r)
         # Joined before they are mirrored: half the booleans.
         made += parts.mirrored(parts.union([nacelle, turning.translate(centre)]))
     return made
@@ -80,7 +80,7 @@ def _afterburners(plane) -> list[Manifold]:
     made, z = [], body.axis(0.5)
     for x in [0.0] if plane.engines == 1 else [-0.92 * r, 0.92 * r]:
         shape = [(1.12, 0.38), (1.12, 0.51), (0.92, 0.56), (0.64, 0.56), (0.54, 0.525), (0.1, 0.525)]
-        made.append(pp.body_of_revolution(parts.scaled(shape, r), (x, 0, z)))
+        made.append(pp.body_of_revolution(shape, (x, 0, z), r))
     return made + parts.mirrored(_intake(plane))
 
 

@@ -10,6 +10,11 @@ from manifold3d import Manifold
 
 from sdfhub.procedural import parts
 
+# Places along an aerofoil of unit chord and thickness, and half its thickness there (NACA report 460).
+_ALONG = (1 - np.cos(np.linspace(0, np.pi, 9))) / 2
+_POWERS = np.stack([np.sqrt(_ALONG), _ALONG, _ALONG**2, _ALONG**3, _ALONG**4])
+_HALF = 5 * np.array([0.2969, -0.126, -0.3516, 0.2843, -0.1036]) @ _POWERS
+
 
 @dataclass(frozen=True)
 class Fuselage:
@@ -80,26 +85,18 @@ def superellipse(segments: int, power: float) -> np.ndarray:
     return np.sign(unit) * np.abs(unit) ** (2 / power)
 
 
-def aerofoil(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
-    """Places along a section of unit chord and thickness, and half its thickness there (NACA report 460)."""
-    x = (1 - np.cos(np.linspace(0, np.pi, points))) / 2
-    powers = np.stack([np.sqrt(x), x, x**2, x**3, x**4])
-    return x, 5 * np.array([0.2969, -0.126, -0.3516, 0.2843, -0.1036]) @ powers
-
-
 def lifting_surface(stations, ratio: float, gauge: float, camber: float = 0.0) -> Manifold:
     """A wing, fin or tailplane with a blunt trailing edge of 0.8 `gauge`, the least thickness.
 
     It runs through stations (leading edge [3], chord, roll of the thickness, 0 for a level wing); `ratio` is
     thickness over chord, `camber` that of the mean line in chords.
     """
-    along, half = aerofoil()
     sections = []
     for leading_edge, chord, roll in stations:
         thick = max(ratio * chord, 1.15 * gauge)
-        offset = np.maximum(thick * half, 0.4 * gauge * np.minimum(1, 4 * np.sqrt(along)))
-        mean = 4 * camber * chord * along * (1 - along)
-        y = np.concatenate([along, along[:0:-1]]) * chord
+        offset = np.maximum(thick * _HALF, 0.4 * gauge * np.minimum(1, 4 * np.sqrt(_ALONG)))
+        mean = 4 * camber * chord * _ALONG * (1 - _ALONG)
+        y = np.concatenate([_ALONG, _ALONG[:0:-1]]) * chord
         up = np.concatenate([mean + offset, (mean - offset)[:0:-1]])
         across = np.outer(up, [-np.sin(roll), 0, np.cos(roll)])
         sections.append(leading_edge + across + np.outer(y, [0, 1, 0]))
@@ -119,9 +116,9 @@ def panel(root, direction, length: float, chords, sweep: float, ratio: float, ga
     return lifting_surface(stations, ratio, gauge)
 
 
-def body_of_revolution(profile, centre, segments: int = 18) -> Manifold:
-    """A lathe along y around `centre`; `profile` holds (radius, y) from the front axis to the rear axis."""
-    return parts.lathe(profile, segments).rotate((-90.0, 0.0, 0.0)).translate(centre)
+def body_of_revolution(profile, centre, radius: float, length: float = 1.0, segments: int = 18) -> Manifold:
+    """A lathe along y around `centre`; `profile` holds (radius, y) from front to rear, in shares."""
+    return parts.lathe(profile, segments, radius, length).rotate((-90.0, 0.0, 0.0)).translate(centre)
 
 
 def jet(radius: float, length: float, centre) -> Manifold:
@@ -130,14 +127,14 @@ def jet(radius: float, length: float, centre) -> Manifold:
     inlet = [(0.66, 0.28), (0.7, 0.04), (0.78, 0.0), (0.86, 0.0)]
     cowl = [(0.94, 0.03), (1.0, 0.16), (1.0, 0.4), (0.9, 0.7), (0.74, 0.86), (0.44, 0.87)]
     cone = [(0.36, 0.98), (0.16, 1.12)]
-    return body_of_revolution(parts.scaled(spinner + inlet + cowl + cone, radius, length), centre, 20)
+    return body_of_revolution(spinner + inlet + cowl + cone, centre, radius, length, 20)
 
 
 def propeller(radius: float, hub: float, blades: int, gauge: float, centre, turn: float) -> list[Manifold]:
     """A pointed spinner with a foot of radius `hub`, and twisted blades, `gauge` thick, in the plane of its
     centre; the first blade stands at `turn` degrees."""
     profile = [(0.12, -1.7), (0.42, -1.5), (0.68, -1.1), (0.88, -0.6), (1.0, 0.0), (1.0, 0.8)]
-    made = [body_of_revolution(parts.scaled(profile, hub, hub), centre, 14)]
+    made = [body_of_revolution(profile, centre, hub, hub, 14)]
     chord, sections = max(0.22 * radius, 2.2 * gauge), []
     stations = (0.0, 0.5, 60), (0.3, 0.8, 45), (0.6, 1.0, 28), (0.92, 0.85, 18), (1, 0.5, 16)
     for share, width, twist in stations:

@@ -9,19 +9,19 @@ from sdfhub.procedural import plane_parts as pp
 
 def tail(plane) -> list[Manifold]:
     """The plane's fins and tailplanes; engines at the rear push a low tailplane up to the fin's top."""
-    style = plane.tail
+    style, is_fighter = plane.tail, plane.kind == "fighter"
     if plane.kind == "business jet" and style in ("conventional", "twin"):
         style = "t"
     if style == "v":
-        return _vee(plane)
-    if style == "twin":
-        return _fighter_fins(plane) + _low_tailplane(plane) if plane.kind == "fighter" else _twin(plane)
-    if plane.kind == "fighter" and style == "cruciform":
-        return [_fin(plane), *_foreplanes(plane)]
-    fin = [_fin(plane)]
-    if style == "conventional":
-        return fin + _low_tailplane(plane)
-    return fin + _raised_tailplane(plane, 0.5 if style == "cruciform" else 0.93)
+        return _low_tailplane(plane, 0.48, np.radians(38), 0.22, 0.14)
+    if style == "twin" and not is_fighter:
+        return _twin(plane)
+    fins = _fighter_fins(plane) if style == "twin" else [_fin(plane)]
+    if style in ("twin", "conventional"):
+        return fins + _low_tailplane(plane, 0.49, 0.06, 0.19, 0.17 if is_fighter else 0.125)
+    if is_fighter and style == "cruciform":
+        return fins + _foreplanes(plane)
+    return fins + _raised_tailplane(plane, 0.5 if style == "cruciform" else 0.93)
 
 
 def _surface(plane, root, direction, length: float, chord: float, sweep: float, taper: float = 0.55):
@@ -47,10 +47,11 @@ def _tailplane(plane, root, roll: float, length: float, chord: float) -> list[Ma
     return parts.mirrored(_surface(plane, root, direction, length, chord, plane.tail_angle))
 
 
-def _low_tailplane(plane) -> list[Manifold]:
-    chord = (0.17 if plane.kind == "fighter" else 0.125) * plane.tail_scale
-    root = np.array([-0.004, 0.49 - chord, plane.body.axis(0.46)])
-    return _tailplane(plane, root, 0.06, 0.19 * plane.tail_scale, chord)
+def _low_tailplane(plane, rear: float, roll: float, length: float, chord: float) -> list[Manifold]:
+    """A tailplane, or a V-tail, that ends at y = `rear`."""
+    length, chord = length * plane.tail_scale, chord * plane.tail_scale
+    root = np.array([-0.006 if plane.tail == "v" else -0.004, rear - chord, plane.body.axis(0.46)])
+    return _tailplane(plane, root, roll, length, chord)
 
 
 def _raised_tailplane(plane, share: float) -> list[Manifold]:
@@ -58,12 +59,6 @@ def _raised_tailplane(plane, share: float) -> list[Manifold]:
     back = share * height * np.tan(np.radians(plane.fin_angle))
     base = root + np.array([-0.004, back - 0.01, share * height])
     return _tailplane(plane, base, 0.0, 0.17 * plane.tail_scale, max(0.62 * chord, 0.09))
-
-
-def _vee(plane) -> list[Manifold]:
-    chord = 0.14 * plane.tail_scale
-    root = np.array([-0.006, 0.48 - chord, plane.body.axis(0.46)])
-    return _tailplane(plane, root, np.radians(38), 0.22 * plane.tail_scale, chord)
 
 
 def _twin(plane) -> list[Manifold]:

@@ -123,7 +123,7 @@ class Plane(SimpleNamespace):
             return [wing]
         r, a = 1.25 * self.gauge, 1.5 * max(self.wing_chord(1), 0.09)
         shape = [(0.15, -0.5), (0.6, -0.42), (0.95, -0.28), (1, 0), (0.9, 0.25), (0.5, 0.43), (0.2, 0.5)]
-        tank = pp.body_of_revolution(parts.scaled(shape, r, a), self.wing_point(0.99, 0.5), 16)
+        tank = pp.body_of_revolution(shape, self.wing_point(0.99, 0.5), r, a, 16)
         return [wing, *parts.mirrored(tank)]
 
     def _wing_tip(self, roll: float) -> list[tuple[np.ndarray, float, float]]:

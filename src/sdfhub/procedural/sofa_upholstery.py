@@ -12,11 +12,6 @@ def back(sofa) -> list[Manifold]:
     return styles.get(sofa.back, _chesterfield)(sofa)
 
 
-def _half(sofa) -> float:
-    """Half the back's width: to the outside of the arms, a little short of it."""
-    return sofa.half_seat if sofa.armless else sofa.half_seat + 0.72 * sofa.arm_width
-
-
 def _lean(sofa, z):
     """How far the back has moved to +y at height z."""
     return sofa.back_lean * np.clip((z - sofa.seat_height) / sofa.back_height, 0, None)
@@ -52,8 +47,8 @@ def _wall(sofa, x: np.ndarray, top: np.ndarray, push=0.0, rows: int = 8) -> Mani
 
 
 def _level(sofa, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    half = _half(sofa)
-    x = np.linspace(-half, half, count)
+    """A level top: stations x [count] of the back from left to right, and its height there."""
+    x = np.linspace(-sofa.half_back, sofa.half_back, count)
     return x, np.full(count, sofa.seat_height + sofa.back_height)
 
 
@@ -65,7 +60,7 @@ def _tight(sofa) -> list[Manifold]:
 
 def _channels(sofa) -> list[Manifold]:
     """Vertical rolls side by side."""
-    count = max(3, round(2 * _half(sofa) / sofa.channel_width))
+    count = max(3, round(2 * sofa.half_back / sofa.channel_width))
     x, top = _level(sofa, 6 * count + 1)
     wave = np.abs(np.sin(np.pi * np.arange(6 * count + 1) / 6))
     return [_wall(sofa, x, top + 0.012 * wave, 0.06 * wave**0.7 - 0.01)]
@@ -88,7 +83,7 @@ def _tufted(sofa) -> list[Manifold]:
         inner = np.clip((sofa.half_seat - abs(x)) / 0.05, 0, 1)
         return 0.055 * inner * np.abs(np.sin(np.pi * (u + v)) * np.sin(np.pi * (u - v))) ** 0.5
 
-    x, top = _level(sofa, 6 * max(4, round(2 * _half(sofa) / step)) + 1)
+    x, top = _level(sofa, 6 * max(4, round(2 * sofa.half_back / step)) + 1)
     return [_wall(sofa, x, top, diamonds, 18)]
 
 
@@ -182,7 +177,7 @@ def _bolsters(sofa, back: float) -> list[Manifold]:
     profile += [(1, 0.9), (0.95, 0.96), (0.82, 0.992), (0.3, 1)]
     x, z = sofa.half_seat - 0.92 * r, sofa.seat_height + 0.88 * r + 0.3 * sofa.crown
     start, end = (x, back + 0.02 - length, z), (x, back + 0.02, z)
-    return parts.mirrored(parts.turned(start, end, parts.scaled(profile, r)))
+    return parts.mirrored(parts.turned(start, end, profile, r))
 
 
 def _pillow(size: float, centre, yaw: float) -> Manifold:

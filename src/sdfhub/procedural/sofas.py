@@ -30,7 +30,9 @@ class Sofa(SimpleNamespace):
     def build(self) -> Manifold:
         """The sofa as one solid, standing on z = 0."""
         self._measure()
-        made = [*self._frame(), *self._arms(), *self._legs(), *sofa_upholstery.back(self)]
+        rear = self.rear - (0.5 * self.wall if self.back == "chesterfield" else 0.012)
+        frame = self._boxes(self.half_seat, rear, self.leg_height, 0.014, 0.0)
+        made = [*frame, *self._arms(), *self._legs(), *sofa_upholstery.back(self)]
         return parts.union([*made, *sofa_upholstery.seats(self), *sofa_upholstery.loose(self)])
 
     def _measure(self) -> None:
@@ -39,9 +41,10 @@ class Sofa(SimpleNamespace):
         chesterfield = self.back == "chesterfield"
         self.wall, self.bend = 0.8 * self.arm_width, 0.14 + 0.5 * self.hump
         self.armless = self.arms == "none" and not chesterfield
-        # Half the width between and over the arms; four seats are narrower ones.
+        # Half the width between and over the arms, and of the back; four seats are narrower ones.
         self.half_seat = 0.5 * self.seats * self.seat_width * (0.88 if self.seats == 4 else 1.0)
         self.half_width = self.half_seat + (0.0 if self.armless else self.arm_width)
+        self.half_back = self.half_seat + (0.0 if self.armless else 0.72 * self.arm_width)
         # y of the seat's front edge, of the frame's back, of the back's front where it meets the seat.
         self.front, self.rear = -self.seat_depth / 2, self.seat_depth / 2 + self.back_thickness
         self.back_face = self.rear - self.wall if chesterfield else self.seat_depth / 2
@@ -51,11 +54,6 @@ class Sofa(SimpleNamespace):
         left, right = self.half_seat - width, self.half_seat
         self.chaise_span = {"right": (left, right), "left": (-right, -left)}.get(self.chaise)
         self.chaise_front = self.front - self.chaise_length
-
-    def _frame(self) -> list[Manifold]:
-        """The upholstered box below the cushions."""
-        rear = self.rear - (0.5 * self.wall if self.back == "chesterfield" else 0.012)
-        return self._boxes(self.half_seat, rear, self.leg_height, 0.014, 0.0)
 
     def _boxes(self, x: float, rear: float, low: float, setback: float, inset: float) -> list[Manifold]:
         """Boxes from `low` to the deck below the seat and the chaise, smaller by `inset` on all sides."""
@@ -146,7 +144,7 @@ class Sofa(SimpleNamespace):
             return parts.bar((*(axis + self.leg_splay * outwards), 0.0), top, 0.45 * w, 0.75 * w)
         bun = [(0.5, 0), (0.62, 0.06), (0.95, 0.25), (1.05, 0.42), (0.9, 0.58), (0.55, 0.66)]
         bun += [(0.75, 0.7), (0.75, 0.76), (0.9, 0.8), (0.9, 1.0)]
-        return parts.turned(below, top, parts.scaled(bun, w))
+        return parts.turned(below, top, bun, w)
 
     def _sled(self) -> list[Manifold]:
         """Loops of bent tube that run from front to back."""

@@ -65,15 +65,9 @@ class Table(SimpleNamespace):
         if self.base == "hairpin":
             return made
         if self.base != "round" and (self.apron or self.drawers):
-            made += self._aprons([top for top, _ in ends])
-        if self.stretchers == "none":
-            return made
-        share = 0.7 * self.stretcher_height
-        joints = [foot + share * (top - foot) for top, foot in ends]
-        if self.stretchers == "shelf":
-            return [*made, parts.box((*(2 * np.abs(joints[0][:2])), 0.026), (0, 0, joints[0][2]))]
-        radii = None if self.base == "square" else (0.015, 0.021)
-        return made + parts.stretchers(joints, self.stretchers, (0.028, 0.04), radii)
+            made += self._aprons(ends)
+        share, radii = 0.7 * self.stretcher_height, None if self.base == "square" else (0.015, 0.021)
+        return made + parts.stretchers(ends, share, self.stretchers, (0.028, 0.04), radii)
 
     def _leg(self, top: np.ndarray, foot: np.ndarray) -> list[Manifold]:
         w, taper = self.leg_width, self.leg_taper
@@ -91,13 +85,13 @@ class Table(SimpleNamespace):
         block, waist = 1 - self.apron_height / self.height - 0.04, 0.55 + 0.25 * taper
         knots = [(0.5, 0), (0.72, 0.02), (0.72, 0.06), (0.5, 0.1), (0.55, 0.13), (waist, 0.3), (1.05, 0.72)]
         knots += [(0.95, 0.84), (0.6, 0.88), (0.9, 0.92), (0.9, 0.96), (0.62, 1.0)]
-        turned = parts.turned(foot, foot + (top - foot) * block, parts.scaled(knots, 0.56 * w))
+        turned = parts.turned(foot, foot + (top - foot) * block, knots, 0.56 * w)
         return [turned, parts.square_bar(foot + (top - foot) * (block - 0.01), top, w)]
 
-    def _aprons(self, tops: list[np.ndarray]) -> list[Manifold]:
+    def _aprons(self, ends: list[tuple[np.ndarray, np.ndarray]]) -> list[Manifold]:
         """Boards between the legs; drawer fronts with knobs in the front one."""
         z, (x, y) = self.rail, self.corner
-        made = parts.aprons(tops, z, 0.024, self.apron_height + 0.02)
+        made = parts.aprons(ends, z, 0.024, self.apron_height + 0.02)
         width = 2 * x - self.leg_width
         for k in range(self.drawers):
             centre = width * ((k + 0.5) / self.drawers - 0.5)

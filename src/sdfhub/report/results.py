@@ -15,9 +15,8 @@ import yaml
 from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
-from sdfhub.locks import locked
 from sdfhub.settings import flat
-from sdfhub.whole_file import write_whole
+from sdfhub.whole_file import locked, write_whole
 
 PLAN, FAILURE = "sweep.json", "failed.json"
 ROLES = ("train", "held_out")

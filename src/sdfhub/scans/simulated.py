@@ -10,7 +10,7 @@ from sdfhub.data.store.store import shape_seed
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.render import seen_from
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.scans.evidence import Evidence
 from sdfhub.scans.observed_scan import ObservedScan, observe
 from sdfhub.scans.scan import LEAST, Scan

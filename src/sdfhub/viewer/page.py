@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sdfhub.errors import SdfhubError
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import sample_surface
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
 from sdfhub.scans.scan import read_scan

@@ -9,9 +9,8 @@ from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_poin
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
-from sdfhub.geometry.surface_sampling import sample_surface
+from sdfhub.geometry.surface import face_normals, piece_count, sample_surface
 from sdfhub.shapes import Frame, NormalizedMesh, ShapeSamples
-from sdfhub.triangles import face_normals, piece_count
 
 if TYPE_CHECKING:
     import trimesh

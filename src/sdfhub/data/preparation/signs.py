@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 
 from sdfhub.data.preparation.visibility import Surface
 from sdfhub.geometry.morton import morton_codes, morton_order
-from sdfhub.geometry.surface_sampling import points_on_faces, random_faces
+from sdfhub.geometry.surface import face_normals, points_on_faces, random_faces
 from sdfhub.geometry.triangle_tree import TriangleTree
-from sdfhub.triangles import face_normals
 
 VOTES, VOTERS = 11, 250_000  # neighbours that vote, of how many visible points (DeepSDF's code)
 INNER = 0.95  # part of the radius of an empty ball whose points take the winding number of its centre

@@ -14,9 +14,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 from sdfhub.data.preparation.settings import Preparation
 from sdfhub.errors import RejectedMesh
-from sdfhub.geometry.surface_sampling import points_on_faces, sphere_directions
+from sdfhub.geometry.surface import face_normals, piece_count, points_on_faces, sphere_directions
 from sdfhub.shapes import NormalizedMesh
-from sdfhub.triangles import face_normals, piece_count
 
 # Read by libigl's first call: shapes run in parallel, not points.
 os.environ.setdefault("IGL_NUM_THREADS", "1")

@@ -16,8 +16,8 @@ from pydantic import BaseModel
 from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
 from sdfhub.data.sources.source import Shape, Source, checked_categories, folder_safe
 from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.geometry.surface import face_normals
 from sdfhub.shapes import Mesh
-from sdfhub.triangles import face_normals
 from sdfhub.whole_file import write_whole
 
 MEASURES = ".measured.json"  # a cache: faces, size and hash of the models seen so far, by file and date

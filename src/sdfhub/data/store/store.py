@@ -32,9 +32,8 @@ from sdfhub.data.store.stored_shape import SUFFIX, Record, StoredShape, arrays_o
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
-from sdfhub.locks import locked
 from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
-from sdfhub.whole_file import write_whole
+from sdfhub.whole_file import locked, write_whole
 
 log = logging.getLogger(__name__)
 
