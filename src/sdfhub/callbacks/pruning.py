@@ -1,13 +1,10 @@
 """Trainings of an Optuna search that are not promising end early."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import lightning as L
 
 from sdfhub.errors import SdfhubError
-
-if TYPE_CHECKING:
-    from optuna.pruners import BasePruner
 
 
 class OptunaPruning(L.Callback):
@@ -15,12 +12,10 @@ class OptunaPruning(L.Callback):
 
     What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's
     sweeper hands no trial on: it is the newest running one with the training's `overrides`, `key=value`.
-    `storage` is the URL of the database of the `study`; `monitor` names the metric, which is minimised.
+    `storage` is the URL of the database of the `study`, `pruner` one of Optuna's; `monitor` names the metric, which is minimised.
     """
 
-    def __init__(
-        self, storage: str, study: str, overrides: list[str], pruner: "BasePruner", monitor: str = "val/cd"
-    ):
+    def __init__(self, storage: str, study: str, overrides: list[str], pruner: Any, monitor: str = "val/cd"):
         self.storage, self.study, self.overrides = storage, study, set(overrides)
         self.pruner, self.monitor = pruner, monitor
 

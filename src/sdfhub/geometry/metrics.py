@@ -138,11 +138,10 @@ def summarize(metrics: Sequence[ShapeMetrics | DistanceMetrics]) -> dict[str, An
             summary[f"cd_{name}_with_failures"] = float(STATISTICS[name](with_failures)) if rows else None
     plain = [asdict(row) for row in metrics if not getattr(row, "failed", False)]
     kind: Any = metrics[0] if metrics else ShapeMetrics
-    for name in (field.name for field in fields(kind)):
-        if name not in ("failed", "cd_penalty"):
-            values = [row[name] for row in plain if row[name] is not None]
-            statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
-            summary[name] = statistics | {"count": len(values)}
+    for name in [field.name for field in fields(kind) if field.name not in ("failed", "cd_penalty")]:
+        values = [row[name] for row in plain if row[name] is not None]
+        statistics = {key: float(of(values)) if values else None for key, of in STATISTICS.items()}
+        summary[name] = statistics | {"count": len(values)}
     return summary
 
 

@@ -21,9 +21,7 @@ class TriangleTree:
     def __init__(self, corners: np.ndarray):
         self._order = morton_order(corners.mean(axis=1))
         self._corners = np.ascontiguousarray(corners[self._order])
-        leaves = 1
-        while leaves * LEAF < len(corners):
-            leaves *= 2
+        leaves = 2 ** max(0, int(np.ceil(np.log2(len(corners) / LEAF))))
         self._starts = np.arange(leaves + 1) * len(corners) // leaves
         first = self._starts[:-1]
         low = np.minimum.reduceat(self._corners.min(axis=1), first)

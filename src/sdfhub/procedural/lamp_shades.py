@@ -18,10 +18,9 @@ def head(lamp, hung: bool) -> Manifold:
     return parts.union(build(lamp, lamp.shade_tall, lamp.gauge, hung))
 
 
-def _bulb(centre: float, radius: float, gauge: float, up: bool) -> list[Manifold]:
-    """A bulb and its socket; `up` tells on which side of the socket the bulb is."""
-    sign = 1 if up else -1
-    low, high = sorted([centre, centre - sign * 1.75 * radius])
+def _bulb(centre: float, radius: float, gauge: float, up: int) -> list[Manifold]:
+    """A bulb and its socket; the bulb is above it where `up` is 1, below it where it is -1."""
+    low, high = sorted([centre, centre - up * 1.75 * radius])
     socket = max(0.55 * radius, 1.5 * gauge)
     return [parts.ellipsoid((radius, radius, 1.2 * radius), (0, 0, centre), 20), rod(low, high, socket)]
 
@@ -59,8 +58,8 @@ def _open(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     size, at = 0.2 * lamp.diameter * lamp.shade_taper, 0.9
     made = [shell, *_spider(lamp, tall, at, gauge)]
     if hung:
-        return [*made, *_bulb(0.45 * tall, size, gauge, False), rod(0.5 * tall, tall + 2 * gauge, gauge)]
-    made += _bulb(0.42 * tall, size, gauge, True)
+        return [*made, *_bulb(0.45 * tall, size, gauge, -1), rod(0.5 * tall, tall + 2 * gauge, gauge)]
+    made += _bulb(0.42 * tall, size, gauge, 1)
     if lamp.fitting == "harp":
         made += [*_harp(tall, at, gauge, 1.45 * size), rod(-2 * gauge, 0.42 * tall, gauge)]
     else:
@@ -99,8 +98,8 @@ def _dome(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     crown = [(1.3 * cap, tall - gauge), (cap, tall + 1.5 * gauge), (gauge, tall + 3 * gauge)]
     made = [parts.revolve_shell(profile, lamp.shade_wall, 40), parts.lathe(crown)]
     if hung:
-        return [*made, *_bulb(0.42 * tall, size, gauge, False), rod(0.42 * tall, tall + 4 * gauge, gauge)]
-    return [*made, *_bulb(0.4 * tall, size, gauge, True), rod(-2 * gauge, tall, gauge)]
+        return [*made, *_bulb(0.42 * tall, size, gauge, -1), rod(0.42 * tall, tall + 4 * gauge, gauge)]
+    return [*made, *_bulb(0.4 * tall, size, gauge, 1), rod(-2 * gauge, tall, gauge)]
 
 
 def _globe(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
@@ -111,7 +110,7 @@ def _globe(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     profile = np.column_stack([wide * np.sin(angle), tall / 2 * (1 - np.cos(angle))])
     made = [parts.revolve_shell(profile, lamp.shade_wall, 36)]
     made.append(parts.lathe([(0.9 * gauge, -3 * gauge), (cap, -1.5 * gauge), (1.2 * cap, 2.4 * gauge)]))
-    made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, True), rod(-3.5 * gauge, 0.4 * tall, gauge)]
+    made += [*_bulb(0.42 * tall, 0.3 * wide, gauge, 1), rod(-3.5 * gauge, 0.4 * tall, gauge)]
     ball = parts.union(made).translate((0, 0, 0.6 * gauge))
     return [ball.rotate((180, 0, 0)).translate((0, 0, tall))] if hung else [ball]
 
@@ -124,7 +123,7 @@ def _bowl(lamp, tall: float, gauge: float, hung: bool) -> list[Manifold]:
     size = min(0.3 * wide, 0.3 * tall)
     made = [parts.revolve_shell(profile, lamp.shade_wall, 40)]
     made.append(parts.lathe([(gauge, -3 * gauge), (1.2 * cap, -gauge), (1.3 * cap, 2 * gauge)]))
-    made += [rod(0, 0.5 * tall, gauge), *_bulb(0.5 * tall, size, gauge, True)]
+    made += [rod(0, 0.5 * tall, gauge), *_bulb(0.5 * tall, size, gauge, 1)]
     if not hung:
         return [*made, rod(-4 * gauge, 0, gauge)]
     apex = tall + 1.1 * wide

@@ -13,6 +13,8 @@ from manifold3d import CrossSection, Manifold, Mesh64, OpType
 Point = Sequence[float] | np.ndarray  # x, y, z
 Profile = Sequence[tuple[float, float]] | np.ndarray  # (radius, height) of a turned part
 
+_SQUARE = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+
 
 def union(parts: Sequence[Manifold]) -> Manifold:
     """The solid covered by any of the parts (exact boolean)."""
@@ -101,14 +103,12 @@ def bar(start: Point, end: Point, radius: float, end_radius: float | None = None
 def square_bar(start: Point, end: Point, width: float, end_width: float | None = None) -> Manifold:
     """A straight bar of square section with its sides along x and y, cut level at both ends."""
     ends = (start, width), (end, width if end_width is None else end_width)
-    square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
-    return loft([level(w * square, 0) + p for p, w in ends])
+    return loft([level(w * _SQUARE, 0) + p for p, w in ends])
 
 
 def plank(start: Point, end: Point, thickness: float, height: float) -> Manifold:
     """A straight board on edge from start to end, its height along z."""
-    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    return sweep(np.array([start, end], float), square * (np.array([thickness, height]) / 2))
+    return sweep(np.array([start, end], float), _SQUARE * [thickness, height])
 
 
 def turned(start: Point, end: Point, profile: Profile, radius: float = 1.0, segments: int = 18) -> Manifold:
