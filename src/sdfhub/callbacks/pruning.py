@@ -12,7 +12,7 @@ class OptunaPruning(L.Callback):
 
     What the training has learnt by then is judged as ever, and its score is the trial's value. Hydra's
     sweeper hands no trial on: it is the newest running one with the training's `overrides`, `key=value`.
-    `storage` is the URL of the `study`'s database, `pruner` one of Optuna's; the metric `monitor` is minimised.
+    `storage` is the URL of the `study`'s database, `pruner` is Optuna's; the metric `monitor` is minimised.
     """
 
     def __init__(self, storage: str, study: str, overrides: list[str], pruner: Any, monitor: str = "val/cd"):
