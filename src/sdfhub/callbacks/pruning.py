@@ -15,7 +15,9 @@ class OptunaPruning(L.Callback):
     `storage` is the URL of the `study`'s database, `pruner` is Optuna's; the metric `monitor` is minimised.
     """
 
-    def __init__(self, storage: str, study: str, overrides: list[str], pruner: Any, monitor: str = "val/cd"):
+    def __init__(
+        self, storage: str | None, study: str | None, overrides: list[str], pruner: Any, monitor: str = "val/cd"
+    ):  # without a search Hydra knows neither of the first two
         self.storage, self.study, self.overrides = storage, study, set(overrides)
         self.pruner, self.monitor = pruner, monitor
 
