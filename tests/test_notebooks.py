@@ -28,7 +28,7 @@ def test_a_notebook_is_committed_without_outputs(path):
 
 @pytest.fixture(scope="module")
 def kernel(tmp_path_factory):
-    """A Python in which notebooks run one after another: to start one and import all takes most of their time."""
+    """A Python in which notebooks run one after another: its start takes most of their time."""
     manager = jupyter_client.AsyncKernelManager()
     yield manager
     if manager.has_kernel:
