@@ -56,7 +56,7 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
 
 
 def winding_numbers(points: np.ndarray, distance: np.ndarray, surface: Surface) -> np.ndarray:
-    """[N] generalised winding numbers of the solid faces around points [N, 3] so far from the nearest face, [N].
+    """[N] generalised winding numbers of the solid faces around points [N, 3], `distance` [N] from any face.
 
     Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds. No face crosses the ball around a
     point whose radius is its distance: the number is computed for the centres of such balls only, from large
