@@ -29,8 +29,7 @@ def design(category: str, index: int):
         raise SdfhubError(f"index={index}: procedural shapes are counted from 0")
     rng, values = np.random.default_rng([CATEGORIES.index(category) + 1, index]), {}
     for name, domain in _DESIGNS[category].parameters.items():
-        drawn = rng.uniform(*domain) if isinstance(domain, tuple) else domain[rng.integers(len(domain))]
-        values[name] = drawn
+        values[name] = rng.uniform(*domain) if type(domain) is tuple else domain[rng.integers(len(domain))]
     return _DESIGNS[category](**values)
 
 
