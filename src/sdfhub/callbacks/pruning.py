@@ -16,7 +16,7 @@ class OptunaPruning(L.Callback):
     """
 
     def __init__(
-        self, storage: str | None, study: str | None, overrides: list, pruner: Any, monitor: str = "val/cd"
+        self, storage: Any, study: str | None, overrides: list[str], pruner: Any, monitor: str = "val/cd"
     ):  # without a search Hydra knows neither of the first two
         self.storage, self.study, self.overrides = storage, study, set(overrides)
         self.pruner, self.monitor = pruner, monitor
