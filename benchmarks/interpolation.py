@@ -15,7 +15,7 @@ from runs import head, row
 
 import sdfhub
 from sdfhub.geometry.render import render
-from sdfhub.triangles import piece_count
+from sdfhub.geometry.surface import piece_count
 
 STEPS = ("known", "1/4", "1/2", "3/4", "known")
 ROWS = 8  # of the sheet
