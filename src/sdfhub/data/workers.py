@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import resource_tracker
 from typing import Any
@@ -53,7 +52,8 @@ def _in_pool(
 ) -> Iterator[tuple[int, Any]]:
     """Results as `map_in_processes` gives them; `waiting` has the items without a result."""
     futures: dict[Future, int] = {}
-    with _pool(function, workers) as pool:
+    pool = _pool(function, workers)
+    try:
         while True:
             for index, item in islice(items, 2 * workers + 1 - len(futures)):
                 waiting[index] = item
@@ -64,10 +64,11 @@ def _in_pool(
                 index, result = futures.pop(future), future.result()
                 del waiting[index]
                 yield index, result
+    finally:
+        pool.shutdown(kill_workers=True)
 
 
-@contextmanager
-def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
+def _pool(function: Callable, workers: int) -> ProcessPoolExecutor:
     before = os.environ.pop(SAFE_PATH, None)
     os.environ[SAFE_PATH] = "1"  # for the processes that clean up after the workers; started once
     resource_tracker.ensure_running()
@@ -75,10 +76,7 @@ def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(workers, env=env, initializer=_start, initargs=arguments)
     del os.environ[SAFE_PATH]
     os.environ |= {SAFE_PATH: before} if before is not None else {}
-    try:
-        yield pool
-    finally:
-        pool.shutdown(kill_workers=True)
+    return pool
 
 
 _function: Callable  # of a worker process: handed over once, since a source with its files may be large

@@ -115,11 +115,8 @@ class ResidentBatches(StepBatches):
     def __init__(self, shapes: Sequence[StoredShape], loading: Loading, device: torch.device):
         super().__init__(shapes, loading)
         self.device, inside = device, loading.samples_per_shape // 2
-        self.wanted = {"outside": loading.samples_per_shape - inside, "inside": inside}
-        self.wanted["surface"] = loading.surface_per_shape
-        for shape in shapes:
-            for name, count in self.wanted.items():
-                refuse_empty(shape, name, count)
+        outside = loading.samples_per_shape - inside
+        self.wanted = {"outside": outside, "inside": inside, "surface": loading.surface_per_shape}
         self.counts = {name: np.array([shape.rows(name) for shape in shapes]) for name in EXTENT}
         self.first = {name: np.cumsum([0, *counts]) for name, counts in self.counts.items()}
         self.tables = {name: self._table(name) for name in EXTENT}
@@ -129,7 +126,8 @@ class ResidentBatches(StepBatches):
         first = self.first[name]
         table = torch.empty((int(first[-1]), COLUMNS[name]), dtype=torch.int16, device=self.device)
         for index, shape in enumerate(self.shapes):
-            array = torch.from_numpy(shape.read(name, 0, shape.rows(name)))
+            refuse_empty(shape, name, self.wanted[name])
+            array = torch.from_numpy(shape.read(name))
             if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
                 what = f"has points up to {reach:.3g} from 0 along an axis"
                 raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")

@@ -178,9 +178,11 @@ class StoredShape:
 
 
 def signed_samples(
-    shape: StoredShape, count: int, rng: np.random.Generator, rows: np.ndarray | None = None
+    shape: StoredShape, count: int | None, rng: np.random.Generator, rows: np.ndarray | None = None
 ) -> np.ndarray:
-    """[count, 4] samples, half outside, half inside (the odd one outside), in contiguous `rows` if given."""
+    """[count, 4] samples (None: all), half of them inside, rounded down; in contiguous `rows` if given."""
+    if count is None:
+        return np.concatenate([shape.read("outside"), shape.read("inside")])
     rows = np.empty((count, 4), np.float32) if rows is None else rows
     draw_rows(rows[: count - count // 2], shape, "outside", rng)
     draw_rows(rows[count - count // 2 :], shape, "inside", rng)
