@@ -129,8 +129,7 @@ class ResidentBatches(StepBatches):
             refuse_empty(shape, name, self.wanted[name])
             array = torch.from_numpy(shape.read(name))
             if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
-                what = f"has points up to {reach:.3g} from 0 along an axis"
-                raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
+                raise SdfhubError(f"{shape.id}: reaches {reach:.3g}; train with data.loader.resident=false")
             fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
             table[first[index] : first[index + 1]] = fractions.to(self.device)
         return table

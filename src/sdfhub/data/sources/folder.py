@@ -15,6 +15,7 @@ from pydantic import BaseModel, StringConstraints
 from sdfhub.data.sources import source as sources
 from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path, read_mesh
 from sdfhub.data.sources.source import Shape, Source, folder_safe
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples
 from sdfhub.whole_file import file_sha256
@@ -146,7 +147,7 @@ class ShapeNetSource(SourceOfFiles):
         self, categories: Mapping, root: str, train_split: str | None = None, test_split: str | None = None
     ):
         super().__init__("shapenet", root, train_split, test_split)
-        self.categories = sorted(sources.checked_categories(categories, Category).items())
+        self.categories = sorted(check(categories, dict[str, Category], "category").items())
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         for category, settings in self.categories:

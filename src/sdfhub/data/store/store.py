@@ -33,7 +33,7 @@ from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
-from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
+from sdfhub.shapes import SHAPE_ID, ShapeSamples
 from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,6 @@ def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
 
 
 def _file(folder: Path, id: str) -> Path:
-    check_id(id)
     return folder / f"{id}{SUFFIX}"
 
 
