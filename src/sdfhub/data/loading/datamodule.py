@@ -88,7 +88,7 @@ class SdfDataModule(L.LightningDataModule):
         if self.source.is_collection and (left_out or (train, held_out) != (self.shapes, self.held_out)):
             counts = f"of {there} shapes {train} are trained on, {held_out} held out, {left_out} left out"
             wanted = f"data.shapes={self.shapes or 'null'} and data.held_out={self.held_out}"
-            log.info(f"data: {self.source.label}: {counts} ({wanted} are upper bounds)")
+            log.info(f"data: {self.source.name}: {counts} ({wanted} are upper bounds)")
         return roles
 
     def prepared(self, roles: Split) -> tuple[list[StoredShape], list[StoredShape]]:

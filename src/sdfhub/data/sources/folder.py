@@ -88,10 +88,6 @@ class FolderSource(SourceOfFiles):
         super().__init__("folder", root, train_split, test_split)
         self.up, self.categories = up, [str(name) for name in categories or ()]
 
-    @property
-    def label(self) -> str:
-        return folder_safe(self.root.resolve().name)
-
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         below = {path: path.relative_to(self.root).with_suffix("") for path in self.root.rglob("*")}
         meshes = (path for path in below if path.suffix.lower() in FORMATS and path.is_file())

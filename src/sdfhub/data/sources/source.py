@@ -43,11 +43,6 @@ class Source(ABC):
     has_normals = True  # whether its shapes come with surface normals
     is_collection = False  # whether it has what it has: numbers of shapes asked for are upper bounds
 
-    @property
-    def label(self) -> str:
-        """What runs and tables may call its shapes."""
-        return self.name
-
     @abstractmethod
     def shapes(self) -> list[Shape]:
         """All shapes on offer, sorted by id, the same in every process; SdfhubError where there is none."""
