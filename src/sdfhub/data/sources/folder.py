@@ -5,7 +5,7 @@ import json
 import os
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
@@ -32,6 +32,8 @@ class SourceOfFiles(Source):
             either is given, unlisted shapes are left out. None lets a seed decide.
     """
 
+    read: Callable[[Path], Mesh | ShapeSamples] = staticmethod(read_mesh)  # what a shape's file holds
+
     def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
         self.root = Path(os.path.abspath(root))
         self.train_split = train_split and os.path.abspath(train_split)
@@ -42,10 +44,6 @@ class SourceOfFiles(Source):
     @abstractmethod
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         """Each shape by id with its file, and its path below the root as split files have it."""
-
-    def read(self, file: Path) -> Mesh | ShapeSamples:
-        """What a shape's file holds."""
-        return read_mesh(file)
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():

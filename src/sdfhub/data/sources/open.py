@@ -108,7 +108,6 @@ class OpenSource(Source):
     def _candidates(self) -> Iterator[tuple[str, Choice, Path, str, dict[str, str]]]:
         """Category, its choice, file, member of the archive (empty: none) and credits."""
         for category, rules in sorted(self.rules.items()):
-            choice: Choice | None
             if choice := rules.catalogue:
                 for archive in sorted(self.root.rglob("*.sh3f")):
                     for member, credits in furniture_in(archive):
