@@ -18,13 +18,14 @@ from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 # what tells the numeric libraries how many threads to start; read when they are imported
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing modules of the current folder
+Numbered = Iterator[tuple[int, Any]]  # items or their results, with the index of the item
 
 
 class Crashed:
     """The result of an item whose worker process died (out of memory, a fault in a native library)."""
 
 
-def map_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[tuple[int, Any]]:
+def map_in_processes(function: Callable, items: Iterable, workers: int) -> Numbered:
     """(index, function(item)) of each item, in the order in which they end; `Crashed` where a worker died.
 
     Function and items are picklable; exceptions are raised here. A worker has one thread. Items are taken
@@ -47,9 +48,7 @@ def map_in_processes(function: Callable, items: Iterable, workers: int) -> Itera
             waiting = {}
 
 
-def _in_pool(
-    function: Callable, items: Iterator[tuple[int, Any]], waiting: dict[int, Any], workers: int
-) -> Iterator[tuple[int, Any]]:
+def _in_pool(function: Callable, items: Numbered, waiting: dict[int, Any], workers: int) -> Numbered:
     """Results as `map_in_processes` gives them; `waiting` has the items without a result."""
     futures: dict[Future, int] = {}
     pool = _pool(function, workers)

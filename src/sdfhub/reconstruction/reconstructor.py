@@ -131,15 +131,10 @@ class Reconstructor:
         near = self.poses.holds(fitted.poses) if self.poses and fitted.poses else [True] * len(group)
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
-            result = Result(
-                name,
-                kind=str(kind),
-                residual=float(fitted.residuals[row]),
-                doubt=float(doubts[row]),
-                code=tuple(fitted.codes[row].tolist()),
-                frame=tuple(map(tuple, matrix.tolist())),
-                mesh=f"{name}.ply" if len(mesh.faces) else None,
-            )
+            residual, doubt = float(fitted.residuals[row]), float(doubts[row])
+            code, frame = tuple(fitted.codes[row].tolist()), tuple(map(tuple, matrix.tolist()))
+            file = f"{name}.ply" if len(mesh.faces) else None
+            result = Result(name, str(kind), residual, doubt, code=code, frame=frame, mesh=file)
             results.append(result.judged(limits.get(kind), bool(near[row])))
             write_mesh(*mesh, out / f"{name}.ply")  # before: a result is whole when it is described
             results[-1].write(out)

@@ -148,13 +148,9 @@ class SdfDataModule(L.LightningDataModule):
         if trainer:
             self.batches.share(trainer.global_rank, trainer.world_size)
             done = lambda: trainer.global_step * trainer.accumulate_grad_batches  # noqa: E731
-        return DataLoader(
-            self.batches,
-            sampler=EpochSteps(len(self.batches), done),
-            batch_size=None,
-            num_workers=0 if resident else self.loader.workers,
-            persistent_workers=False,  # a worker of the last epoch would not hear of the next
-        )
+        steps, workers = EpochSteps(len(self.batches), done), 0 if resident else self.loader.workers
+        # workers do not persist: one of the last epoch would not hear of the next
+        return DataLoader(self.batches, sampler=steps, batch_size=None, num_workers=workers)
 
     def val_dataloader(self) -> DataLoader:
         """Yields a few `ValidationShape`, held-out ones first."""

@@ -99,9 +99,7 @@ class FolderSource(SourceOfFiles):
         for id, file in sorted(sources.unique_ids(ids, self.root).items()):
             category = id.partition("/")[0]
             if category in (self.categories or there):
-                # a name may hold bytes of another encoding, which JSON would not take
-                credits = {"title": os.fsencode(file.name).decode(errors="replace")}
-                yield Shape(id, category, _fingerprint(file), credits=credits), file, below[file].as_posix()
+                yield Shape(id, category, _fingerprint(file)), file, below[file].as_posix()
 
 
 def _id(path: Path) -> str:

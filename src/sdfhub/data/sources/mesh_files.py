@@ -130,10 +130,7 @@ def _by_trimesh(content: bytes, suffix: str, buffers: dict[str, bytes]) -> Mesh:
     import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
 
     if suffix in (".obj", ".off"):  # names and comments may be in any encoding, numbers are the same in all
-        try:
-            content.decode()
-        except UnicodeDecodeError:
-            content = content.decode("latin-1").encode()
+        content = content.decode(errors="replace").encode()
     options = {"skip_materials": True} if suffix in (".obj", ".glb", ".gltf") else {}
     file, kind = io.BytesIO(content), suffix[1:]
     with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused later
