@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from sdfhub.latent.fitting import Shapes
+from sdfhub.latent.fitting import Poses, Shapes
 from sdfhub.latent.gaussian import Gaussian
-from sdfhub.latent.similarity import SIZE, PoseRange, small_similarity, turns
+from sdfhub.latent.similarity import SIZE, small_similarity, turns
 from sdfhub.model.decoder import Decoder
 
 ROWS_AT_ONCE = 2**12  # rows differentiated at a time on a CPU, by each thread; bounds memory
@@ -68,9 +68,7 @@ class Problem:
     which one a shape has; the decoder is in evaluation mode.
     """
 
-    def __init__(
-        self, decoder: Decoder, priors: list[tuple[Gaussian, float]], delta: float, poses: PoseRange | None
-    ):
+    def __init__(self, decoder: Decoder, priors: list[tuple[Gaussian, float]], delta: float, poses: Poses):
         self.decoder, self.delta, self.has_pose = decoder, delta, poses is not None
         like = priors[0][0].mean
         self.size = len(like)

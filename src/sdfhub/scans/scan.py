@@ -12,7 +12,7 @@ import numpy as np
 
 from sdfhub.data.sources import mesh_files
 from sdfhub.data.sources.deepsdf import npz_array, read_samples
-from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
 
 FORMATS = (*mesh_files.FORMATS, ".xyz", ".npy", ".npz")
@@ -89,8 +89,6 @@ def read_scan(path: str | Path) -> Scan:
             return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
         mesh = mesh_files.read_mesh(path)
         return Scan(mesh.vertices, faces=mesh.faces)
-    except RejectedMesh as rejection:
-        raise SdfhubError(rejection.detail) from rejection
     except SdfhubError:
         raise
     except Exception as error:  # the readers raise whatever broken bytes lead to

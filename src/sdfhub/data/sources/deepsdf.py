@@ -43,8 +43,7 @@ def read_samples(path: Path) -> ShapeSamples:
         raise RejectedMesh("one_sided_samples", f"{path}: {outside} samples outside, {inside} inside")
     rows = np.concatenate(parts)
     if (reach := np.abs(rows[:, :3]).max()) > REACH:
-        what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
-        raise RejectedMesh("wrong_frame", what)
+        raise RejectedMesh("wrong_frame", f"{path}: has points {reach:.3g} from 0 along an axis, not near 1")
     none, frame = np.zeros((0, 3), dtype=np.float32), frame_of(path) or NORMALIZED
     share = {"inside": inside / len(rows)}
     return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, share)

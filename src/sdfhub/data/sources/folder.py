@@ -26,10 +26,8 @@ LAYOUTS = ("models/model_normalized.obj", "model.obj")  # of a ShapeNet model's 
 class SourceOfFiles(Source):
     """A source of one file per shape below a root, named for `kind` and its root.
 
-    Args:
-        root: the folder that holds the files.
-        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
-            either is given, unlisted shapes are left out. None lets a seed decide.
+    `train_split` and `test_split` are files that list the training and the held-out shapes; see `with_roles`.
+    Where either is given, unlisted shapes are left out. None lets a seed decide.
     """
 
     read: Callable[[Path], Mesh | ShapeSamples] = staticmethod(read_mesh)  # what a shape's file holds

@@ -113,7 +113,8 @@ def prepare_part(
         for index, result in bar:
             if isinstance(result, Crashed):
                 what = "the worker process died: out of memory, or a fault in a native library"
-                write_shape(_file(folder, left[index].id), {}, _record(left[index], what, reason="crash"))
+                record = _record(left[index], what, reason="crash")
+                write_shape(folder / f"{left[index].id}{SUFFIX}", {}, record)
     return len(left)
 
 
@@ -144,7 +145,7 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
         record = _record(shape, f"{type(error).__name__}: {error}", reason="error")
     seconds = round(time.perf_counter() - start, 4)
-    write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
+    write_shape(folder / f"{shape.id}{SUFFIX}", arrays, replace(record, seconds=seconds))
 
 
 def _record(shape: Shape, detail: str = "", **known: Any) -> Record:
@@ -158,13 +159,9 @@ def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     return [shape for shape in shapes if final.get(shape.id) != shape.fingerprint]
 
 
-def _file(folder: Path, id: str) -> Path:
-    return folder / f"{id}{SUFFIX}"
-
-
 def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -> dict[str, StoredShape]:
     """The stored shapes of some ids, in their order, without those that are missing or clearly damaged."""
-    paths = {id: _file(folder, id) for id in ids}
+    paths = {id: folder / f"{id}{SUFFIX}" for id in ids}
     for parent in {path.parent for path in paths.values()}:
         if not parent.resolve().is_relative_to(folder.resolve()):
             raise SdfhubError(f"{parent}: leads out of the store; remove that link")
