@@ -19,10 +19,7 @@ from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing modules of the current folder
 Numbered = Iterator[tuple[int, Any]]  # items or their results, with the index of the item
-
-
-class Crashed:
-    """The result of an item whose worker process died (out of memory, a fault in a native library)."""
+Crashed = BrokenProcessPool  # an item's result if its worker died: out of memory, a fault in a native library
 
 
 def map_in_processes(function: Callable, items: Iterable, workers: int) -> Numbered:
@@ -43,8 +40,8 @@ def map_in_processes(function: Callable, items: Iterable, workers: int) -> Numbe
             for index, item in waiting.items():
                 try:
                     yield from _in_pool(function, iter([(index, item)]), {}, 1)
-                except BrokenProcessPool:
-                    yield index, Crashed()
+                except BrokenProcessPool as error:
+                    yield index, error
             waiting = {}
 
 

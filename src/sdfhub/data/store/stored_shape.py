@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import field
 from io import BufferedReader
 from pathlib import Path
@@ -156,13 +156,11 @@ class StoredShape:
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
-        try:
-            with self._opened() as file:
-                file.seek(self._start)
-                digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
+        with suppress(SdfhubError), self._opened() as file:
+            file.seek(self._start)
+            digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
             return digest.hexdigest() == self.record.sha256
-        except SdfhubError:
-            return False
+        return False
 
     @contextmanager
     def _opened(self) -> Iterator[BufferedReader]:
