@@ -67,8 +67,7 @@ class GaussNewtonFit:
             def fit(group: Shapes) -> list[Tensor]:
                 prior = [0 if shape.is_exact else 1 + shape.partial for shape in group]
                 rows = Rows.of(group, self.smallest, prior, codes.device)
-                few = not any(prior)
-                starts = (blind[:1], min(1, self.nearest)) if few else (blind, self.nearest)
+                starts = (blind, self.nearest) if any(prior) else (blind[:1], min(1, self.nearest))
                 return self._fit(problem, codes, *starts, rows)
 
             fitted, residuals, *pose = in_groups(fit, observations, codes.device)

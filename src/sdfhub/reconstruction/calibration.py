@@ -25,7 +25,6 @@ from sdfhub.whole_file import file_sha256, write_whole
 log = logging.getLogger(__name__)
 
 FILE = "calibration.json"
-KEPT = TypeAdapter(dict[str, dict[str, dict[str, Any]]])  # its content, by digest and kind of scans
 RULE = "residual, residual * (1 + unusual)^4, in the units of the scan"  # limits of others count no more
 
 
@@ -55,11 +54,10 @@ class Calibration:
 
         `settings` are all that fits depend on, `unseen_shapes` gives up to so many shapes of the run's data.
         """
-        key = digest(run, settings)
         kept: dict[str, Any] = {}
         with suppress(OSError, ValueError):  # missing or broken: that costs a calibration
-            kept = KEPT.validate_json((run / FILE).read_bytes())
-        known = kept.setdefault(key, {})
+            kept = TypeAdapter(dict[str, dict[str, dict[str, Any]]]).validate_json((run / FILE).read_bytes())
+        known = kept.setdefault(digest(run, settings), {})
         missing = [kind for kind in kinds if "limits" not in known.get(str(kind), {})]
         shapes = unseen_shapes(self.shapes) if missing else []
         if missing and len(shapes) < 3:

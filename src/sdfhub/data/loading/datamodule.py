@@ -95,8 +95,7 @@ class SdfDataModule(L.LightningDataModule):
         """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
         store = self.filled(roles)
         train, held_out = ([store[s.id] for s in part if s.id in store] for part in roles)
-        what = f"{len(train)} shapes to train on, {len(held_out)} held out, {len(store.rejected)} rejected"
-        log.info(f"data: {self.source.name}: {what}")
+        log.info(f"data: {self.source.name}: {len(train)} shapes to train on, {len(held_out)} held out")
         log.info(f"store: {store.folder}: {store.summary()}")
         return train, held_out
 

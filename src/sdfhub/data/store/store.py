@@ -68,10 +68,10 @@ class Store(dict[str, StoredShape]):
     def summary(self) -> str:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
-        kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         such = {record.reason: f"{id} ({record.detail})" for id, record in self.rejected.items()}
         counts = Counter(record.reason for record in self.rejected.values()).most_common()
         rejected = "".join(f"\n  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts)
+        kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         return f"{kept}; preparing took {seconds:.2f} s a shape{rejected}"
 
 

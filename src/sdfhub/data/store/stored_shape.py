@@ -171,8 +171,7 @@ class StoredShape:
                 yield file
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-            again = "start or prepare again: damaged shapes are prepared anew"
-            raise SdfhubError(f"{self.path}: {why}; {again}") from error
+            raise SdfhubError(f"{self.path}: {why}; start again: damaged shapes are prepared anew") from error
 
 
 def signed_samples(
