@@ -120,9 +120,7 @@ def _archive(path: Path) -> Scan:
         points, sdf = samples.points.astype(np.float64), samples.sdf.astype(np.float64)
         return Scan(points, sdf=sdf, frame=samples.frame)
     if "points" not in names:
-        raise ValueError(
-            f"holds {', '.join(sorted(names)) or 'nothing'}; expected pos and neg, or points (and sdf)"
-        )
+        raise ValueError(f"holds {', '.join(sorted(names)) or 'nothing'}; expected points, or pos and neg")
     parts = {name: npz_array(path, name).astype(np.float64) for name in names & _PARTS}
     if "sdf" not in parts:
         return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))

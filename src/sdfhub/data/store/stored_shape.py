@@ -171,7 +171,7 @@ class StoredShape:
                 yield file
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-            raise SdfhubError(f"{self.path}: {why}; start again: damaged shapes are prepared anew") from error
+            raise SdfhubError(f"{self.path}: {why}; start or prepare again: it is made anew") from error
 
 
 def signed_samples(
