@@ -54,16 +54,20 @@ class Plan(BaseModel, extra="forbid"):
 
 def read_plan(sweep: Path) -> Plan:
     """What a sweep's folder consists of; refuses one that is none, or whose `sweep.json` is broken."""
+    return read_json(Plan, sweep / PLAN, "the folder of a multirun")
+
+
+def read_json(kind: type[BaseModel], path: Path, owner: str) -> Any:
+    """What a JSON file says, checked; a folder that has no such file is refused as not `owner`."""
     try:
-        return Plan.model_validate_json((sweep / PLAN).read_bytes())
+        return kind.model_validate_json(path.read_bytes())
     except OSError as error:
-        raise SdfhubError(f"{sweep}: not the folder of a multirun: it has no {PLAN}") from error
+        raise SdfhubError(f"{path.parent}: not {owner}: it has no {path.name}") from error
     except ValidationError as error:
-        raise SdfhubError(f"{sweep / PLAN}: {first_fault(error)}") from error
+        raise SdfhubError(f"{path}: {_first_fault(error)}") from error
 
 
-def first_fault(error: ValidationError) -> str:
-    """Where the first fault of checked data lies, and what it is."""
+def _first_fault(error: ValidationError) -> str:
     fault = error.errors()[0]
     return f"{'.'.join(map(str, fault['loc']))}: {fault['msg'].lower()}"
 
@@ -200,4 +204,4 @@ def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        raise SdfhubError(f"{name}.{first_fault(error)}") from error
+        raise SdfhubError(f"{name}.{_first_fault(error)}") from error

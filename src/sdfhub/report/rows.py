@@ -61,8 +61,8 @@ class Group:
         done = [cell for row in self.rows for cell in row.done]
         self.first = done[0] if done else None
         self.settings = [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
-        self.place = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}  # columns of a CSV file
-        self.place["settings"] = ";".join(self.settings)
+        groups = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}
+        self.place = groups | {"settings": ";".join(self.settings)}  # columns of a CSV file
         counts = sorted({cell.scores.trained_on for cell in done})
         ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]

@@ -26,9 +26,7 @@ ABOUT_CD = (
     "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
     "between those of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t)."
 )
-ABOUT_DISTANCES = (
-    "No meshes, no CD. |f - d| times 10³, over samples near a shape's surface, then over shapes."
-)
+ABOUT_DISTANCES = "No meshes, no CD. |f - d| times 10³, over samples near a surface, then over shapes."
 ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
 ABOUT_COSTS = "Samples are signed distances drawn in all. Times compare on one idle machine."
 ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
@@ -74,9 +72,8 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = [
-                NONE if a == NONE else f"{a}, {b}{n}" for a, b, n in zip(means, medians, seeds, strict=True)
-            ]
+            parts = zip(means, medians, seeds, strict=True)
+            texts = [NONE if mean == NONE else f"{mean}, {median}{count}" for mean, median, count in parts]
             frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
         if (frame.iloc[:, 1:] != NONE).any(axis=None):
             overviews.append(Table(f"{TITLES[role]}, excess", frame, ABOUT_OVERVIEW))

@@ -4,8 +4,6 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -85,10 +83,7 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def is_positional(word: str) -> bool:
     """Whether a word is a value without its name: an existing path, or neither assignment nor option."""
-    with suppress(OSError, ValueError):  # longer than a name may be, or with a NUL
-        if word and Path(word).exists():
-            return True
-    return "=" not in word and not word.startswith(("-", "~"))
+    return os.path.exists(word) or ("=" not in word and not word.startswith(("-", "~")))
 
 
 def quoted(word: str) -> str:
@@ -96,7 +91,7 @@ def quoted(word: str) -> str:
 
     In quotes a backslash counts only before a quote, and `${` begins an interpolation, which `\\${` does not.
     """
-    if re.fullmatch(r"\d+", word) and not Path(word).exists():
+    if re.fullmatch(r"\d+", word) and not os.path.exists(word):
         return word
     word = re.sub(r"(\\*)\$\{", r"\1\1\\${", word)
     word = re.sub(r"(\\*)'", r"\1\1\\'", word)

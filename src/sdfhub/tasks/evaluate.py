@@ -57,16 +57,12 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str],
     if ids is not None:
         train, unseen = [id for id in ids if id in train], [id for id in ids if id not in train]
         if trained_on := seen.intersection(unseen):
-            raise SdfhubError(
-                f"shapes: {min(trained_on)} was trained on; leave out data= to judge it as such"
-            )
+            raise SdfhubError(f"shapes: {min(trained_on)} was trained on; leave out data= to judge it so")
     elif count is not None:
         unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).held_out]
     elif train:
         unseen = trained["held_out"]
-    for id in (*train, *unseen):
-        if id not in offered:
-            raise SdfhubError(
-                f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
-            )
+    if unknown := {*train, *unseen} - offered.keys():
+        some = ", ".join(list(offered)[:3])
+        raise SdfhubError(f"shapes: {source.name} has no shape {min(unknown)!r}; it has {some} ...")
     return Split([offered[id] for id in train], [offered[id] for id in unseen])

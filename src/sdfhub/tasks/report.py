@@ -51,13 +51,11 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
 
 def page(**content: Any) -> str:
     """The page: text is escaped, and its policy lets no request out."""
-    folder = files("sdfhub.report")
-    style, script = ((folder / name).read_text("utf-8") for name in ("page.css", "viewer.js"))
+    script = (files("sdfhub.report") / "viewer.js").read_text("utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     loader = PackageLoader("sdfhub.report", ".")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-    environment.filters["data_uri"] = picture_uri
-    content |= {"style": Markup(style), "script": Markup(script), "script_hash": Markup(f"sha256-{digest}")}
+    content |= {"script": Markup(script), "script_hash": Markup(f"sha256-{digest}"), "uri": picture_uri}
     return environment.get_template("page.html.j2").render(content)
 
 

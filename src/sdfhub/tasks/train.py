@@ -123,13 +123,11 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
 
 def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
     """The objects of a group of named parts, all of a Lightning `kind`; a part that is null is left out."""
-    parts = []
-    for name, node in (config or {}).items():
-        if node is not None:
-            parts.append(instantiate(node, f"{group}.{name!s}"))
-            if not isinstance(parts[-1], kind):
-                raise SdfhubError(f"{group}.{name!s}: is no Lightning {kind.__name__}; give it a _target_")
-    return parts
+    nodes = {f"{group}.{name!s}": node for name, node in (config or {}).items() if node is not None}
+    parts = {key: instantiate(node, key) for key, node in nodes.items()}
+    if wrong := [key for key, part in parts.items() if not isinstance(part, kind)]:
+        raise SdfhubError(f"{wrong[0]}: is no Lightning {kind.__name__}; give it a _target_")
+    return list(parts.values())
 
 
 def make_optimisation(config: DictConfig) -> Optimisation:
@@ -145,9 +143,7 @@ def make_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], lo
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
-        raise SdfhubError(
-            f"trainer.strategy={config.strategy}: meshing needs a whole model a device; use ddp"
-        )
+        raise SdfhubError(f"trainer.strategy={config.strategy}: meshing needs a whole model; use ddp")
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
@@ -175,9 +171,7 @@ def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
         is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
         if parts.trainer.world_size == 1 or not is_loss:
             raise
-        raise SdfhubError(
-            "another process of this run has died; continue from its last checkpoint"
-        ) from error
+        raise SdfhubError("another process of this run has died; continue its last checkpoint") from error
 
 
 def refuse_processes_in_multirun(trainer: Trainer) -> None:

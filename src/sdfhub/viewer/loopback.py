@@ -23,9 +23,7 @@ from sdfhub.errors import SdfhubError
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # what a browser may call this machine
-MAX_UPLOAD = 64 << 20
-"""Bytes of an uploaded file. A larger one, or one of another type, arrives as an empty one."""
-
+MAX_UPLOAD = 64 << 20  # bytes of a file; a larger one, or one of another type, arrives as an empty one
 PART = 512 << 10  # bytes of the parts in which viser's page sends a file
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "

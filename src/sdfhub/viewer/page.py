@@ -25,9 +25,7 @@ FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
 
 POINTS = 4000  # points of a scan's surface that are shown
 DIRECTIONS, REACH = 6, 3.0  # sliders along principal directions, and how far they go, in standard deviations
-RUNGS = (64, 128)
-"""Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
-
+RUNGS = (64, 128)  # points along an axis of the grid while something moves, and on the way to rest
 FAR = 0.03  # mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves
 STRANGE = 2.0  # times as unusual as the most unusual of the space's own codes: no shape of its kind
 MEAN = "(mean of all shapes)"
@@ -106,9 +104,7 @@ class Viewer:
         with torch.no_grad():
             distance = float(self.space.sdf(surface, code).abs().mean())
         is_strange = self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max()
-        doubt = (
-            " Doubtful: far, or a code unlike those of this space." if distance > FAR or is_strange else ""
-        )
+        doubt = " Doubtful: far, or a code unlike the known ones." if distance > FAR or is_strange else ""
         return f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2.{doubt}"
 
     def _draw(self, meshed: Meshed | SdfhubError) -> None:
