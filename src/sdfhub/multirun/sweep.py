@@ -1,7 +1,4 @@
-"""A multirun from its plan to its report, and each of its cells.
-
-A cell is trained once and continued where it was interrupted; its failure is written down.
-"""
+"""A multirun from its plan to its report; each cell trained once, continued, its failure written down."""
 
 import json
 import logging
@@ -30,9 +27,7 @@ from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan, 
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
-Train = Callable[[DictConfig, Path], dict[str, Any]]
-"""Trains what a composed config describes into a folder; returns what `metrics.json` holds."""
-
+Train = Callable[[DictConfig, Path], dict[str, Any]]  # of a config into a folder: what `metrics.json` holds
 WATCHING_GROUPS = ("callbacks", "logger", "debug", "paths", "extras")
 UNNAMED = {"conditioning", "decoder", "loss", "optim"}  # groups that name no row: they count as settings
 

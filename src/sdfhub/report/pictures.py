@@ -22,9 +22,7 @@ from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
 from sdfhub.report.rows import Group, Row
 from sdfhub.shapes import Frame, UpAxis, turned_up
 
-PIXELS, PAPER = 208, 0.955
-"""Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
-
+PIXELS, PAPER = 208, 0.955  # side of a picture, and its grey level: a tile on a light page and on a dark one
 TRIANGLES = 1500  # of a mesh to turn, some 12 bytes each
 FindTruth = Callable[[Cell, str], StoredShape | None]
 """The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
@@ -62,9 +60,8 @@ class Sheet(NamedTuple):
         """The meshes to turn: a dict a shape with its `name`, its `role` and its meshes, labelled."""
         shapes = []
         for column, (role, id) in enumerate(self.shapes):
-            panels = [
-                {"label": label} | mesh for label, tiles in self.rows if (mesh := tiles[column].turning)
-            ]
+            labelled = [(label, tiles[column].turning) for label, tiles in self.rows]
+            panels = [{"label": label} | mesh for label, mesh in labelled if mesh]
             shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
         return shapes
 

@@ -1,8 +1,7 @@
 """A sweep's folder as plain data: the cells that `sweep.json` lists, and what each has left behind, checked.
 
-A cell is one training. Its folder is named after all its settings: cells of another scale, category or seed
-lie side by side, and a cell whose settings have changed since is superseded, not overwritten. Nothing in a
-cell's files is run, and no link is followed out of its folder.
+A cell is one training, its folder named after all its settings. Nothing in a cell's files is run, and no
+link is followed out of its folder.
 """
 
 import json

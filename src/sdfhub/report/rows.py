@@ -11,14 +11,11 @@ from scipy import stats
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell
 from sdfhub.settings import OF_THE_SEED, deciding
 
+# encodings, as the paper writes them or would
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
-"""The paper's names of encodings, and ours for those that it does not name."""
-
+# groups and settings that decide which shapes are judged, and how: rows that differ in one are not compared
 JUDGING_GROUPS = ("sweeps", "data", "category", "scale", "fit", "evaluate")
-"""Config groups under which numbers may be compared: rows that differ in one stand in different tables."""
-
-JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
-"""Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
+JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")  # but for `data.loader.`
 
 MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
 NAMES = ["method", "normals", "detail", "label"]

@@ -19,8 +19,8 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.opening import beside, load, write_space
 from sdfhub.whole_file import write_whole
 
+# what a space is exported as in one file, and its name by default
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
-"""What a space is exported as in one file, and the file's name by default."""
 
 
 def export(config: DictConfig) -> None:

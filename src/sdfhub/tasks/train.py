@@ -57,7 +57,6 @@ NO_CONCERN = (
 OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
 """Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
 
-
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 """Settings that change neither the model nor its data: a run may go on with others."""
 
@@ -81,8 +80,7 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     if config.ckpt_path:
         read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
-    data.prepare_data()
-    data.setup("fit")
+    data.setup("fit")  # prepares shapes that are missing
     ids, held_out = ([shape.id for shape in role] for role in (data.train_shapes, data.held_out_shapes))
     if config.ckpt_path:
         refuse_other_shapes(Path(config.ckpt_path), ids)

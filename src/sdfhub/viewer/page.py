@@ -20,18 +20,16 @@ from sdfhub.space import Space
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
 
+# meshes and clouds of a whole shape; archives also carry views and samples, whose frame has to be said
 FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
-"""Meshes and clouds of a whole shape. Archives also carry views and samples, whose frame has to be said."""
-
 POINTS = 4000  # points of a scan's surface that are shown
 DIRECTIONS, REACH = 6, 3.0  # sliders along principal directions, and how far they go, in standard deviations
 RUNGS = (64, 128)  # points along an axis of the grid while something moves, and on the way to rest
 FAR = 0.03  # mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves
 STRANGE = 2.0  # times as unusual as the most unusual of the space's own codes: no shape of its kind
 MEAN = "(mean of all shapes)"
+# where the camera stands and looks, z up: a little past the shape, which the controls would cover
 EYE_AND_AIM = np.array([[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]])
-"""Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
-
 CLAY, SCAN = (201, 131, 92), (42, 92, 170)
 STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
@@ -74,11 +72,10 @@ class Viewer:
         """Back to the shape A itself."""
         for slider in (self.share, *self.sliders):
             slider.value = 0.0
-        points = self.scans.get(self.a.value)
+        name = self.a.value
         with self.server.atomic():
-            self.scan.visible = points is not None
-            if points is not None:
-                self.scan.points = points
+            self.scan.visible = name in self.scans
+            self.scan.points = self.scans.get(name, self.scan.points)
         self.refresh()
 
     def fit(self, name: str, content: bytes) -> None:
@@ -162,12 +159,9 @@ class Viewer:
 
 def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
     """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame."""
-    suffix = PurePath(name).suffix.lower()
-    if suffix not in FORMATS:
-        raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
     rng = np.random.default_rng(0)
     with TemporaryDirectory() as folder:  # a .gltf can name files of its folder: there are none
-        path = Path(folder) / f"scan{suffix}"
+        path = Path(folder) / f"scan{PurePath(name).suffix}"
         path.write_bytes(content)
         try:
             scan = read_scan(path)
