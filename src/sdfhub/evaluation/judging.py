@@ -64,8 +64,8 @@ def evaluate_model(
 ) -> dict[str, Any]:
     """Judges training shapes, by rows of the codes [S, L], and held-out ones; writes and gives the scores.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Codes of held-out shapes
-    are fitted under the clamp `delta`. `training` is plain data for `metrics.json`.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. `training` is for
+    `metrics.json`, as it is.
     """
     decoder.eval()
     known = list(train.items())[: evaluation.train]

@@ -37,8 +37,7 @@ log = logging.getLogger(__name__)
 class SweepRecord(Callback):
     """`sweep.json` before the first cell, the report after the last; status 1 where a cell failed."""
 
-    def __init__(self) -> None:
-        self._cells: list[PlannedCell] = []
+    _cells: list[PlannedCell] = []  # noqa: RUF012 - replaced, never changed
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ = state

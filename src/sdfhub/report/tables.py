@@ -93,8 +93,8 @@ def origin(commands: list[str], cells: list[Cell]) -> Table:
 
 def _lines(group: Group, role: str) -> pd.DataFrame:
     """The statistics of a role, a line for each row; not a number where a row has none."""
-    lines = group.statistics[group.statistics.index.get_level_values("role") == role].droplevel("role")
-    return lines.reindex([row.label for row in group.rows])
+    rows = pd.MultiIndex.from_product([[row.label for row in group.rows], [role]])
+    return group.statistics.reindex(rows).droplevel(1)
 
 
 def _scores(group: Group, role: str, title: str, quantities: dict[str, str], about: str) -> Table | None:
