@@ -64,8 +64,8 @@ def evaluate_model(
 ) -> dict[str, Any]:
     """Judges training shapes, by rows of the codes [S, L], and held-out ones; writes and gives the scores.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. `training` is for
-    `metrics.json`, as it is.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Fits are clamped by
+    `delta`; `training` is for `metrics.json`.
     """
     decoder.eval()
     known = list(train.items())[: evaluation.train]

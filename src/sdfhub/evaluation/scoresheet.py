@@ -43,10 +43,7 @@ class Judged:
 def write_scores(
     judged: Sequence[Judged], evaluation: Any, training: dict[str, Any] | None, out: Path
 ) -> dict[str, Any]:
-    """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
-
-    Returns what `metrics.json` holds: settings, numbers about the training, a role's `summary` and `shapes`.
-    """
+    """Writes `metrics.csv`, `contact_sheet.png` and, which is returned, `metrics.json`; prints the table."""
     import pandas  # here: slow to import, and every training would wait for it before its first step
 
     result: dict[str, Any] = {"evaluation": asdict(evaluation), "training": training}

@@ -24,7 +24,7 @@ from sdfhub.space import reconstruct
 class Validation:
     """Scores a training shape with its own code, or a held-out one with a code fitted to its samples.
 
-    Draws the same samples every time; changes neither weights nor random states.
+    Coarse and cheap, not for tables. The same samples every time; neither weights nor random states change.
     """
 
     fit: SkipValidation[Fit]  # finds the codes of held-out shapes

@@ -24,8 +24,7 @@ from sdfhub.shapes import Frame, UpAxis, turned_up
 
 PIXELS, PAPER = 208, 0.955  # side of a picture, and its grey level: a tile on a light page and on a dark one
 TRIANGLES = 1500  # of a mesh to turn, some 12 bytes each
-FindTruth = Callable[[Cell, str], StoredShape | None]
-"""The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
+FindTruth = Callable[[Cell, str], StoredShape | None]  # a cell's shape by id, where it is on this machine
 
 
 class ShownMesh(NamedTuple):

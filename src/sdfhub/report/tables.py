@@ -14,12 +14,12 @@ from sdfhub.report.rows import NONE, Group, differing, settings_of
 
 TITLES = {"train": "Training shapes", "held_out": "Held-out shapes"}
 
+# columns of `Group.statistics` by their headings: of shapes with meshes, and of those without
 SURFACES = {"CD mean": "cd_mean", "CD median": "cd_median", "floor": "floor_mean"}
 SURFACES |= {"excess mean": "excess_mean", "excess median": "excess_median"}
 SURFACES |= {"normals": "normal_consistency_mean", "no surface": "no_surface"}
 DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_median"}
 DISTANCES |= {"signs right": "sign_accuracy_mean"}
-"""Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
 
 ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
@@ -49,13 +49,12 @@ def tables(group: Group) -> list[Table]:
     scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
     first = {row.label: settings_of(row.first) for row in group.rows if row.first}
     lines = sorted((key, *values) for key, values in differing(list(first.values())).items())
-    settings = pd.DataFrame(lines, columns=["setting", *first])
+    frame = pd.DataFrame(lines, columns=["setting", *first])
+    settings = Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True)
     cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
     reasons = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
-    absent = pd.DataFrame(reasons, columns=["cell", "state", "reason"])
-    prose = [Table("Settings that differ", settings, ABOUT_SETTINGS, prose=True), _costs(group)]
-    prose += [Table("Not there", absent, prose=True)]
-    return [table for table in (*scores, *prose) if table and len(table.frame)]
+    absent = Table("Not there", pd.DataFrame(reasons, columns=["cell", "state", "reason"]), prose=True)
+    return [table for table in (*scores, settings, _costs(group), absent) if table and len(table.frame)]
 
 
 def overview(groups: list[Group]) -> list[Table]:

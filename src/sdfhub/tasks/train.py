@@ -44,6 +44,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
 WHOLE_MODEL = ("auto", "ddp")  # strategies that leave every weight on every device, as meshing needs
 
+# Lightning's warnings that a user can do nothing about
 NO_CONCERN = (
     ".*does not have many workers.*",
     ".*number of training batches.*smaller than the logging interval.*",
@@ -52,13 +53,8 @@ NO_CONCERN = (
     ".*ended before the epoch ended.*",  # the loader starts from the step that a checkpoint ends with
     ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
 )
-"""Lightning's warnings that a user can do nothing about."""
-
-OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
-"""Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
-
+# settings that change neither the model nor its data: a run may go on with others
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
-"""Settings that change neither the model nor its data: a run may go on with others."""
 
 
 @dataclass(frozen=True)
@@ -147,11 +143,6 @@ def make_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], lo
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
     ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
     ours["plugins"] = [WholeFileIO()]
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
-        logging.getLogger(name).handlers.clear()
-        logging.getLogger(name).propagate = True
-    for name in OF_NO_CONCERN:
-        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     return instantiate(config, "trainer", **given)
 

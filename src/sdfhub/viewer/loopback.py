@@ -25,12 +25,12 @@ HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # what a browser may call this machine
 MAX_UPLOAD = 64 << 20  # bytes of a file; a larger one, or one of another type, arrives as an empty one
 PART = 512 << 10  # bytes of the parts in which viser's page sends a file
+# what the page may load: itself, and from nowhere but here
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
     "style-src 'unsafe-inline'; img-src blob: data:; font-src data:; connect-src ws://{host} blob: data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What the page may load: itself, and from nowhere but here."""
 
 _QUIET = logging.getLogger(__name__)
 _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, and none for a traceback
