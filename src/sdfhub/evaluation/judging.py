@@ -129,7 +129,7 @@ def distance_metrics(decoder: Decoder, code: Tensor, shape: StoredShape, delta: 
     """How far the field is from a shape's own samples, up to 100,000 a side."""
     rng = np.random.default_rng(0)
     counts = {name: shape.rows(name) for name in ("outside", "inside")}
-    sides = [shape.read(name, rng.integers(n or 1), min(n, 100_000)) for name, n in counts.items()]
+    sides = [shape.read(name, int(rng.integers(n or 1)), min(n, 100_000)) for name, n in counts.items()]
     rows = torch.from_numpy(np.concatenate(sides)).to(code.device)
     field = distances(decoder, rows[None, :, :3], code[None])[0]
     error = (field - rows[:, 3]).abs()[rows[:, 3].abs() < delta].mean()

@@ -3,10 +3,10 @@
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ COLUMNS = {  # of the printed table: headings and factors; files carry all metri
 TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """One judged shape; `pictures` of those on the contact sheet."""
 
     role: str  # `train` or `held_out`

@@ -6,12 +6,11 @@ link is followed out of its folder.
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
-from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, Json, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.locks import locked
@@ -59,16 +58,9 @@ def read_plan(sweep: Path) -> Plan:
 def read_json(kind: type[BaseModel], path: Path, owner: str) -> Any:
     """What a JSON file says, checked; a folder that has no such file is refused as not `owner`."""
     try:
-        return kind.model_validate_json(path.read_bytes())
+        return _checked(Json[kind], path.read_bytes(), str(path))  # type: ignore[valid-type]
     except OSError as error:
         raise SdfhubError(f"{path.parent}: not {owner}: it has no {path.name}") from error
-    except ValidationError as error:
-        raise SdfhubError(f"{path}: {_first_fault(error)}") from error
-
-
-def _first_fault(error: ValidationError) -> str:
-    fault = error.errors()[0]
-    return f"{'.'.join(map(str, fault['loc']))}: {fault['msg'].lower()}"
 
 
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
@@ -123,8 +115,7 @@ class Training(BaseModel, frozen=True):
     made_with: dict[Name, Name] = {}
 
 
-@dataclass(frozen=True)
-class Scores:
+class Scores(NamedTuple):
     """The scores of a finished cell."""
 
     shapes: dict[str, list[ShapeScore] | list[DistanceScore]]  # by role
@@ -146,8 +137,7 @@ class Scores:
         return costs
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A cell of a sweep as it stands; `failed` also where its files are broken."""
 
     plan: PlannedCell
@@ -203,4 +193,5 @@ def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        raise SdfhubError(f"{name}.{_first_fault(error)}") from error
+        fault = error.errors()[0]
+        raise SdfhubError(f"{'.'.join(map(str, (name, *fault['loc'])))}: {fault['msg'].lower()}") from error

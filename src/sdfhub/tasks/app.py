@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -16,8 +17,8 @@ from sdfhub.multirun.names import register_resolvers
 
 Task = Callable[[DictConfig], float | None]  # of a composed config; a search lowers what is returned
 
+# Hydra's options whose value is the next word
 TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p")
-"""Hydra's options whose value is the next word."""
 
 
 def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> None:
@@ -87,12 +88,8 @@ def is_positional(word: str) -> bool:
 
 
 def quoted(word: str) -> str:
-    """A word as a string of Hydra's grammar, whatever is in it; a number that is no path stays one.
-
-    In quotes a backslash counts only before a quote, and `${` begins an interpolation, which `\\${` does not.
-    """
+    """A word as a string of Hydra's grammar, whatever is in it; a number that is no path stays one."""
     if re.fullmatch(r"\d+", word) and not os.path.exists(word):
         return word
-    word = re.sub(r"(\\*)\$\{", r"\1\1\\${", word)
-    word = re.sub(r"(\\*)'", r"\1\1\\'", word)
-    return "'" + re.sub(r"(\\+)$", r"\1\1", word) + "'"
+    word = re.sub(r"(\\*)\$\{", r"\1\1\\${", word)  # `${` begins an interpolation, `\${` does not
+    return QuotedString(word, Quote.single).with_quotes()

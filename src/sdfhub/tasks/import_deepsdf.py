@@ -68,7 +68,8 @@ def import_deepsdf(composed: DictConfig) -> None:
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
     specs = read_json(Specs, folder / "specs.json", "an experiment of DeepSDF's")
     codes = read_codes(folder / "LatentCodes" / f"{epoch}.pth", specs.CodeLength)
-    file, node = folder / "ModelParameters" / f"{epoch}.pth", decoder_node(specs)
+    file = folder / "ModelParameters" / f"{epoch}.pth"
+    node = config["decoder"] | decoder_settings(specs)
     weights = decoder_weights(_read(file, "model_state_dict"), node, file)
     saved_decoder(node, weights, file)  # or says what does not fit
     names = shape_names(folder, specs, config["split"], len(codes))
@@ -89,22 +90,17 @@ def import_deepsdf(composed: DictConfig) -> None:
     log.info("run: %s: %d shapes, %d of them with their source's frame", run, len(load(run).ids), len(known))
 
 
-def decoder_node(specs: Specs) -> dict[str, Any]:
-    """DeepSDF's decoder as a node of our config."""
+def decoder_settings(specs: Specs) -> dict[str, Any]:
+    """The settings of an experiment's decoder in our config; others are those of decoder=deepsdf."""
     network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
     return {
-        "_target_": "sdfhub.model.decoder.Decoder",
-        "encoding": {"_target_": "sdfhub.model.encodings.Identity"},
-        "activation": {"_target_": "sdfhub.model.activations.Relu", "_partial_": True},
         "code_size": specs.CodeLength,
         "depth": depth,
         "width": network.dims[0],
         "inject_encoding": list(range(1, depth + 1)) if network.xyz_in_all else network.latent_in,
         "inject_code": network.latent_in,
-        "shorten": True,
         "weight_norm": False,
         "dropout": network.dropout_prob if {*range(depth)} <= {*(network.dropout or [])} else 0.0,
-        "tanh": True,
     }
 
 

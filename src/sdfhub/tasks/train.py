@@ -2,11 +2,10 @@
 
 import logging
 import warnings
-from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import hydra
 import torch
@@ -57,8 +56,7 @@ NO_CONCERN = (
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 
 
-@dataclass(frozen=True)
-class Parts:
+class Parts(NamedTuple):
     """What a config describes, made once, before the first shape is prepared."""
 
     data: SdfDataModule

@@ -13,6 +13,7 @@ import socket
 from collections.abc import Collection
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import viser
@@ -44,12 +45,8 @@ class LoopbackServer(viser.ViserServer):
             socket.create_server((HOST, port)).close()
         except OSError as error:
             raise SdfhubError(f"port={port}: is taken or not allowed; 0 takes a free one") from error
-        plain = sockets.serve
-        sockets.serve = partial(_Serve, suffixes)  # type: ignore[misc, assignment]  # viser has no option for it
-        try:
+        with patch.object(sockets, "serve", partial(_Serve, suffixes)):  # viser has no option for it
             super().__init__(host=HOST, port=port, label=label, verbose=False)
-        finally:
-            sockets.serve = plain  # type: ignore[misc]
 
 
 def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:
