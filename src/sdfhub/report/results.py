@@ -1,11 +1,11 @@
 """A sweep's folder as plain data: the cells that `sweep.json` lists, and what each has left behind, checked.
 
-A cell is one training, its folder named after all its settings. Nothing in a cell's files is run, and no
-link is followed out of its folder.
+A cell is one training. Nothing in its files is run, and no link is followed out of its folder.
 """
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -25,7 +25,6 @@ Text = Annotated[str, StringConstraints(max_length=2000)]
 FolderName = Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_length=255)]
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
-Name = Annotated[str, StringConstraints(max_length=300)]
 
 
 class PlannedCell(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -80,7 +79,7 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None =
 class ShapeScore(BaseModel, frozen=True):
     """One judged shape."""
 
-    id: Name
+    id: Text
     cd: Number | None
     floor: Number
     cd_penalty: Number  # the Chamfer distance of a single point
@@ -101,7 +100,7 @@ class ShapeScore(BaseModel, frozen=True):
 class DistanceScore(BaseModel, frozen=True):
     """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
 
-    id: Name
+    id: Text
     sdf_error: Number
     sign_accuracy: Number
 
@@ -112,7 +111,7 @@ class Training(BaseModel, frozen=True):
     seconds: Number
     steps: Count
     parameters: Count
-    made_with: dict[Name, Name] = {}
+    made_with: dict[Text, Text] = {}
 
 
 class Scores(NamedTuple):
@@ -127,13 +126,11 @@ class Scores(NamedTuple):
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
         costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
         settings = flat(self.config)
-        try:
+        with suppress(KeyError, TypeError, ValueError, OverflowError):  # a loader of the user's own
             costs["epochs"] = int(settings["trainer.max_epochs"])
             rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
             shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
             costs["samples"] = shapes * int(settings["data.loader.samples_per_shape"]) * self.training.steps
-        except (KeyError, TypeError, ValueError, OverflowError):
-            pass  # a loader of the user's own
         return costs
 
 
@@ -174,7 +171,7 @@ def read_scores(folder: Path) -> Scores:
         kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
         shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
     training = _checked(Training, metrics.get("training"), "metrics.json: training")
-    trained_on = _checked(list[Name], _read(folder, "split.json").get("train"), "split.json: train")
+    trained_on = _checked(list[Text], _read(folder, "split.json").get("train"), "split.json: train")
     return Scores(shapes, training, len(trained_on), _read(folder, "config.yaml"))
 
 

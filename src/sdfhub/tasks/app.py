@@ -15,14 +15,12 @@ from sdfhub.composition import configuration_folder, drop_replaced, one_line
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import register_resolvers
 
-Task = Callable[[DictConfig], float | None]  # of a composed config; a search lowers what is returned
-
 # Hydra's options whose value is the next word
 TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p")
 
 
-def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> None:
-    """Composes `config_name` with the words of the command line and runs `task` on it.
+def run_task(task: Callable[[DictConfig], float | None], config_name: str, positional: Sequence[str]) -> None:
+    """Composes `config_name` with the command line's words and runs `task`, whose result a search lowers.
 
     Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C; 1 where
     Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
@@ -70,8 +68,7 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     """
     given = {word.partition("=")[0] for word in argv if not is_positional(word)}
     left = [name for name in names if name.removesuffix("...") not in given]
-    overrides: list[str] = []
-    many: list[str] = []
+    overrides, many = list[str](), list[str]()
     for before, word in zip(["", *argv], argv, strict=False):
         if before in TAKES_A_VALUE or not is_positional(word) or not left:
             overrides.append(word)

@@ -116,8 +116,7 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
             raise SdfhubError(f"out={out}: the result of {path} would overwrite {mesh}")
     reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
-    scans: dict[str, ObservedScan] = {}
-    results: list[Result] = []
+    scans, results = dict[str, ObservedScan](), list[Result]()
     for name, path in tqdm(files.items(), desc="reading", unit="scan", leave=False, disable=None):
         try:
             scans[name] = reconstructor.read(path, sensor)

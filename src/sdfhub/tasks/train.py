@@ -37,8 +37,6 @@ from sdfhub.settings import WHERE_NOT_WHAT, flat
 
 log = logging.getLogger(__name__)
 
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-
 # half precision needs a loss scale; pieces of a batch are differentiated without one
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
 WHOLE_MODEL = ("auto", "ddp")  # strategies that leave every weight on every device, as meshing needs
@@ -91,7 +89,11 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
         return {}
     if not (folder / "checkpoints" / LAST).exists():  # callbacks without one of checkpoints
         trainer.save_checkpoint(folder / "checkpoints" / LAST)
-    metrics = judge(model, parts, folder)
+    training = parts.record.summary(model) | {"made_with": made_with(trainer)}
+    model.to(trainer.strategy.root_device)  # Lightning has put it back on the CPU
+    trained = model.decoder, model.codes.table.detach(), model.loss.delta
+    shapes = dict(enumerate(data.train_shapes)), data.held_out_shapes
+    metrics = evaluate_model(*trained, *shapes, parts.evaluation, folder, training)
     log_scores(trainer, written, metrics)
     return metrics
 
@@ -100,11 +102,10 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     """The objects of a training; refuses a setting that is unknown, missing, of the wrong type or range."""
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
-    torch.manual_seed(check(config.seed, Seed, "seed"))
-    model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
+    torch.manual_seed(check(config.seed, Annotated[int, Field(ge=0, lt=2**31)], "seed"))
+    names = ["decoder", "codes", "loss", "computing", *(["validation"] if config.get("validation") else [])]
+    model = {name: instantiate(config[name], name) for name in names}
     model["optim"] = make_optimisation(config.optim)
-    validation = config.get("validation")
-    model["validation"] = instantiate(validation, "validation") if validation else None
     record = TrainingRecord()
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
@@ -189,15 +190,6 @@ def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
         if before != now:
             what = f"code {row} is that of {before}, now it would be that of {now}"
             raise SdfhubError(f"ckpt_path={checkpoint}: the shapes that data= offers have changed: {what}")
-
-
-def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
-    """What `metrics.json` holds: the training's cost and the scores of training and held-out shapes."""
-    training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
-    model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
-    train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
-    codes, delta = model.codes.table.detach(), model.loss.delta
-    return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
 
 
 def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:

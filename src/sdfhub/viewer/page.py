@@ -14,7 +14,6 @@ from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface_sampling import sample_surface
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
-from sdfhub.scans.scan import read_scan
 from sdfhub.shapes import turned_up
 from sdfhub.space import Space
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
@@ -38,8 +37,7 @@ class Viewer:
     """The page of a space, its grid of `resolution` points along an axis when nothing moves."""
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
-        self.space = space
-        self.scans: dict[str, np.ndarray] = {}
+        self.space, self.scans = space, dict[str, np.ndarray]()
         # codes [L] by the names under which the page offers them
         self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
         self.axes = space.principal_directions[:DIRECTIONS]
@@ -164,16 +162,15 @@ def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarra
         path = Path(folder) / f"scan{PurePath(name).suffix}"
         path.write_bytes(content)
         try:
-            scan = read_scan(path)
+            scan = scans.read_scan(path)
             observed = observe(scan, space.evidence, "shape", rng)
             code = space.fit_observations([observed.observation]).codes[0]
         except (SdfhubError, ValueError) as error:
             reason = str(error).replace(str(path), name)
             raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
-    if scan.faces is None:
-        surface = scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    else:
-        surface = sample_surface(scan.points, scan.faces, POINTS, rng)[0]
+    points, faces = scan.points, scan.faces
+    rows = rng.permutation(len(points))[:POINTS]
+    surface = points[rows] if faces is None else sample_surface(points, faces, POINTS, rng)[0]
     return code, observed.frame.to_normalized(surface).astype(np.float32)
 
 
