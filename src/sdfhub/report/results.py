@@ -57,7 +57,7 @@ def read_plan(sweep: Path) -> Plan:
 def read_json(kind: type[BaseModel], path: Path, owner: str) -> Any:
     """What a JSON file says, checked; a folder that has no such file is refused as not `owner`."""
     try:
-        return _checked(Json[kind], path.read_bytes(), str(path))  # type: ignore[valid-type]
+        return _checked(Json[kind], path.read_bytes(), str(path))  # type: ignore[misc, valid-type]
     except OSError as error:
         raise SdfhubError(f"{path.parent}: not {owner}: it has no {path.name}") from error
 
