@@ -26,6 +26,8 @@ WAYS = {
     "muon, decoys": ["optimizer=muon", *DECOYS],
     "muon, far": ["optimizer=muon", *FAR],
     "muon, decoys, far": ["optimizer=muon", *DECOYS, *FAR],
+    "soap": ["optimizer=soap"],
+    "soap, far": ["optimizer=soap", *FAR],
     "muon, rotated": ["optimizer=muon", "encoding=rotated"],
 }
 

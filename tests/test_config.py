@@ -21,9 +21,22 @@ NO_CHOICES = [("data", "default"), ("category", "any")]
 """What all sources share; the categories of a source that has none."""
 NO_CHOICES += [("callbacks", name) for name in composed()["callbacks"]]
 """Parts, which the default lists."""
-CHOICES = {(path.parent.name, path.stem) for path in CONF.glob("*/*.yaml")} - {*NO_CHOICES}
-CHOICES = sorted(choice for choice in CHOICES if choice[0] not in ("sweeps", "hparams_search"))
-"""Sweeps and searches have tests of their own."""
+ALONE = ["experiment", "scale", "debug"]
+"""They set keys of other groups."""
+ELSEWHERE = ["sweeps", "hparams_search"]
+"""They have tests of their own."""
+
+
+def compositions() -> list[list[str]]:
+    """Every choice of conf/ in at least one of them: the n-th choices of most groups together."""
+    groups: dict[str, list[str]] = {}
+    for path in sorted(CONF.glob("*/*.yaml")):
+        group, choice = path.parent.name, path.stem
+        if group not in ELSEWHERE and (group, choice) not in NO_CHOICES:
+            groups.setdefault(group, []).append(f"{group}={choice}")
+    alone = [[word] for group in ALONE for word in groups.pop(group)]
+    most = max(len(words) for words in groups.values())
+    return alone + [[words[n % len(words)] for words in groups.values()] for n in range(most)]
 
 
 def parameters(*words: str) -> int:
@@ -31,12 +44,9 @@ def parameters(*words: str) -> int:
     return sum(parameter.numel() for parameter in decoder.parameters())
 
 
-@pytest.mark.parametrize(("group", "choice"), CHOICES)
-def test_every_choice_composes_and_builds(group, choice, tmp_path):
-    config = composed(f"{group}={choice}")
-    for name in ("logger", "callbacks"):
-        if group != name:
-            config[name] = {}
+@pytest.mark.parametrize("words", compositions(), ids=" ".join)
+def test_every_choice_composes_and_builds(words, tmp_path):
+    config = composed(*words)
     if config.trainer.accelerator == "gpu" and not torch.cuda.is_available():
         config.trainer.accelerator = "cpu"
     parts = make_parts(config, tmp_path)

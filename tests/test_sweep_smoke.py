@@ -9,7 +9,7 @@ from sdfhub.report.results import read_sweep
 from sdfhub.report.rows import group_cells
 from tests.browser import empty_page
 from tests.commands import Command
-from tests.test_notebooks import NOTEBOOKS, run_notebook
+from tests.test_notebooks import NOTEBOOKS, kernel, run_notebook  # noqa: F401
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def test_the_smoke_sweep_killed_halfway_goes_on_to_its_report(smoked):
         assert "FFT/SIREN" in (sweep / "report" / name).read_text()
 
 
-def test_the_notebook_about_sweeps_runs_and_finds_this_one_finished(smoked, monkeypatch):
-    run_notebook(NOTEBOOKS[-1], smoked["root"] / "notebooks", monkeypatch)
+def test_the_notebook_about_sweeps_runs_and_finds_this_one_finished(smoked, kernel, monkeypatch):  # noqa: F811
+    run_notebook(NOTEBOOKS[-1], smoked["root"] / "notebooks", kernel, monkeypatch)
     assert smoked["first"].stat().st_mtime_ns == smoked["written"]
 
 

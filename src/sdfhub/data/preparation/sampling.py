@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sdfhub.data.preparation.settings import DEFAULT, Preparation
-from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points
+from sdfhub.data.preparation.signs import SIGN_METHODS, SignMethod, nearest_points, winding_numbers
 from sdfhub.data.preparation.visibility import Surface, closed_surface, visible_surface
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.geometry.morton import morton_order
@@ -48,7 +48,7 @@ def prepare_mesh(
     rng = np.random.default_rng(seed)
     surface = closed_surface(normalized) if preparation.sign == "winding" else None
     signed = _signed_samples(surface, SIGN_METHODS["pseudo_normal"], preparation, rng) if surface else None
-    if not surface or not signed or not _winding_agrees(surface, signed[0], signed[1], rng):
+    if not surface or not signed or not _winding_agrees(surface, signed[0], signed[1]):
         surface = visible_surface(normalized, preparation, rng)
         method = preparation.sign if callable(preparation.sign) else SIGN_METHODS[preparation.sign]
         signed = _signed_samples(surface, method, preparation, rng)
@@ -106,12 +106,10 @@ def _signed_samples(
     return points[order], sdf[order], statistics
 
 
-def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray, rng: np.random.Generator) -> bool:
+def _winding_agrees(surface: Surface, points: np.ndarray, sdf: np.ndarray) -> bool:
     """Whether the winding number confirms the pseudo-normal, which self-intersections mislead."""
-    order = morton_order(points[:PROBES])
-    probes, sdf = points[order], sdf[order]
-    inside = SIGN_METHODS["winding"](probes, nearest_points(probes, surface), surface, rng).inside
-    return bool(np.mean(inside != (sdf < 0)) < 0.002)
+    probes, sdf = points[:PROBES], sdf[:PROBES]
+    return bool(np.mean((winding_numbers(probes, np.abs(sdf), surface) > 0.5) != (sdf < 0)) < 0.002)
 
 
 def normalize_mesh(

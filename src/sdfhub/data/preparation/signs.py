@@ -20,7 +20,8 @@ VOTES, VOTERS = 11, 250_000  # neighbours that vote, of how many visible points 
 INNER = 0.95  # part of the radius of an empty ball whose points take the winding number of its centre
 CLEAR = 0.1  # distance of a winding number from a whole one below which other points may take it
 ROUGH, CLOSE = 1.0, 2.0  # radii from which libigl sums up faces: errors to 0.6 (1 in 1000 above 0.3), 0.01
-WINDING_EDGE = 0.1  # above it faces are cut before a tree is built over them
+LONGEST, LONGEST_FOR_FEW = 0.1, 0.3  # edges: longer ones are cut before a tree is built over faces
+FEW = 10_000  # points, for which a tree of less cut faces is built sooner than it is slower
 ROOM = 50_000  # pieces that cutting may add: it pays where few triangles are long
 
 
@@ -49,17 +50,23 @@ def nearest_points(points: np.ndarray, surface: Surface) -> Nearest:
 
 
 def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: np.random.Generator) -> Signs:
-    """Inside where the generalised winding number of the solid faces is above 1/2.
+    """Inside where the generalised winding number of the solid faces is above 1/2."""
+    winding = winding_numbers(points, nearest.distance, surface)
+    return Signs(winding > 0.5, np.abs(winding - 0.5) > 0.25)
+
+
+def winding_numbers(points: np.ndarray, distance: np.ndarray, surface: Surface) -> np.ndarray:
+    """[N] generalised winding numbers of the solid faces around points [N, 3], `distance` [N] from any face.
 
     Source: Barill et al. 2018, Fast Winding Numbers for Soups and Clouds. No face crosses the ball around a
     point whose radius is its distance: the number is computed for the centres of such balls only, from large
     cells to small ones, and handed to the other points of the ball when it is clearly a whole one.
     """
     order = morton_order(points)
-    points, distance = points[order], nearest.distance[order]
+    points, distance = points[order], distance[order]
     codes, winding, todo = morton_codes(points), np.empty(len(points)), np.arange(len(points))
-    tree = igl.FastWindingNumberBVH()
-    tree.init(*cut_long(surface.vertices, surface.solid(), WINDING_EDGE), 2)
+    tree, longest = igl.FastWindingNumberBVH(), LONGEST if len(points) > FEW else LONGEST_FOR_FEW
+    tree.init(*cut_long(surface.vertices, surface.solid(), longest), 2)
     for level in range(8, 0, -1):  # cells of 3/4 down to 6/1024 a side
         if not len(todo):
             break
@@ -75,7 +82,7 @@ def winding_signs(points: np.ndarray, nearest: Nearest, surface: Surface, rng: n
         todo = todo[~shared]
     winding[todo] = _winding_numbers(tree, points[todo])
     winding[order] = winding.copy()
-    return Signs(winding > 0.5, np.abs(winding - 0.5) > 0.25)
+    return winding
 
 
 def _winding_numbers(tree: igl.FastWindingNumberBVH, points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Muon steps hidden matrices as PyTorch's own, everything else as Adam."""
+"""Muon and SOAP step hidden matrices as their plain twins, everything else as Adam."""
 
 import copy
 from functools import partial
@@ -10,7 +10,7 @@ from torch import nn
 from sdfhub.model.activations import Siren
 from sdfhub.model.conditioning import Film
 from sdfhub.model.encodings import Identity
-from sdfhub.model.muon import Muon, orthogonalized
+from sdfhub.model.matrix_optimisers import Muon, Soap, orthogonalized
 from sdfhub.model.optimisers import Cosine, Optimisation
 from tests.test_model import small_decoder
 
@@ -78,12 +78,53 @@ def test_steps_are_those_of_pytorchs_muon_beside_adam():
         schedule.step()
 
 
-def test_its_state_goes_through_a_checkpoint():
+def soap_of(matrix: nn.Parameter, **settings) -> Soap:
+    bias = nn.Parameter(torch.zeros(4))
+    return Soap([{"params": [matrix], "matrices": True}, {"params": [bias]}], **settings)
+
+
+def test_soap_is_adam_in_a_turned_basis():
+    """Its twin turns the gradient with double precision and lets PyTorch's Adam step what was turned."""
+    torch.manual_seed(0)
+    matrix = nn.Parameter(torch.randn(6, 4, dtype=torch.float64))
+    soap = soap_of(matrix, lr=1e-2, beta=0.9, every=100)
+    first = torch.randn(6, 4, dtype=torch.float64)
+    left = torch.linalg.eigh(first @ first.T).eigenvectors
+    right = torch.linalg.eigh(first.T @ first).eigenvectors
+    turned = nn.Parameter(left.T @ matrix.detach() @ right)
+    adam = torch.optim.Adam([turned], lr=1e-2, betas=(0.9, 0.9))
+    for step in range(8):
+        matrix.grad = first if step == 0 else torch.randn_like(first)
+        turned.grad = left.T @ matrix.grad @ right
+        soap.step()
+        adam.step()
+        assert torch.allclose(left.T @ matrix @ right, turned, atol=1e-7)
+
+
+def test_soaps_basis_follows_the_gradients():
+    """The power method ends at the eigenvectors of the mean products, of gradients that stay."""
+    torch.manual_seed(0)
+    u, v = (torch.linalg.qr(torch.randn(4, 4, dtype=torch.float64)).Q for _ in range(2))
+    matrix = nn.Parameter(torch.zeros(4, 4, dtype=torch.float64))
+    soap = soap_of(matrix, every=1, beta=0.5)
+    matrix.grad = torch.randn(4, 4, dtype=torch.float64)
+    soap.step()
+    for _ in range(60):
+        matrix.grad = u @ torch.diag(torch.tensor([4.0, 3.0, 2.0, 1.0], dtype=torch.float64)) @ v.T
+        soap.step()
+    for basis, true in zip(soap.state[matrix]["bases"], (u, v), strict=True):
+        overlap = (basis.T @ true).abs()
+        assert torch.allclose(overlap.max(dim=0).values, torch.ones(4, dtype=torch.float64), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [Muon, Soap])
+def test_its_state_goes_through_a_checkpoint(kind):
+    optimisation = Optimisation(1e-3, 1e-2, Cosine(), optimizer=kind)
     torch.manual_seed(0)
     decoder, codes = small_decoder(Siren(15.0, 3.0), Identity()), nn.Parameter(torch.randn(2, 4))
     twin, twin_codes = copy.deepcopy(decoder), copy.deepcopy(codes)
-    made = OPTIMISATION.configure(decoder.parameters(), [codes], 20, decoder.hidden_matrices())[0]
-    other = OPTIMISATION.configure(twin.parameters(), [twin_codes], 20, twin.hidden_matrices())[0]
+    made = optimisation.configure(decoder.parameters(), [codes], 20, decoder.hidden_matrices())[0]
+    other = optimisation.configure(twin.parameters(), [twin_codes], 20, twin.hidden_matrices())[0]
     gradients(decoder, codes)
     made.step()
     other.load_state_dict(copy.deepcopy(made.state_dict()))
