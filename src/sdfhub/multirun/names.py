@@ -61,8 +61,8 @@ def cell_name(*, _root_: DictConfig) -> str:
 
 def choices_of(config: DictConfig, hydra: DictConfig) -> dict[str, str]:
     """The choice of each group; shapes of a source without categories are called by its folder."""
-    chosen = hydra.runtime.choices.items()
-    choices = {group: str(choice) for group, choice in chosen if choice and "/" not in group}
+    choices = hydra.runtime.choices.items()
+    choices = {group: str(choice) for group, choice in choices if choice and "/" not in group}
     source: Any = OmegaConf.select(config, "data.source") or {}
     if source.get("root") and not source.get("categories"):
         choices["category"] = Path(source.root).resolve().name
