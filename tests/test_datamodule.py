@@ -180,7 +180,7 @@ def test_a_folder_of_eight_meshes_is_enough(tmp_path, caplog):
     data = SdfDataModule(source, str(tmp_path / ".store"), 1, shapes=20, preparation=few)
     data.prepare_data()
     assert (len(data.train_shapes), len(data.held_out_shapes)) == (7, 1)
-    line = f"data: {source.label}: of 8 shapes 7 are trained on, 1 held out, 0 left out (data.shapes=20 and"
+    line = f"data: {source.name}: of 8 shapes 7 are trained on, 1 held out, 0 left out (data.shapes=20 and"
     assert line in caplog.text
 
 

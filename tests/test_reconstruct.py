@@ -264,7 +264,7 @@ MISTAKES = {
     "sensor=[1,2]": ["sensor"],
     "scans=nowhere.ply": ["nowhere.ply", "no such file"],
     "fit.shrinkage=2": ["shrinkage"],
-    "calibration.shapes=1": ["calibration", "at least 3"],
+    "calibration.shapes=1": ["calibration.shapes=1", "equal to 3"],
 }
 
 

@@ -355,4 +355,3 @@ def test_a_root_means_the_same_from_any_folder(tmp_path, monkeypatch):
     sources.append(ShapeNetSource({"chairs": CATEGORIES["chairs"]}, "my meshes", "split.json"))
     for source in sources:
         assert source.root == tmp_path / "my meshes" and source.train_split == str(tmp_path / "split.json")
-    assert sources[0].label == "my_meshes"

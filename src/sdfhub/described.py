@@ -147,5 +147,9 @@ def check(value: Any, hint: Any, key: str) -> Any:
     try:
         return TypeAdapter(hint, config=None if own else config).validate_python(value)
     except ValidationError as error:
-        wanted = dict.fromkeys(problem["msg"].lower().removeprefix("input ") for problem in error.errors())
+        problems = error.errors()
+        if isinstance(value, Mapping):  # names the first fault in it
+            problems = problems[:1]
+            key, value = ".".join(map(str, (key, *problems[0]["loc"]))), problems[0]["input"]
+        wanted = dict.fromkeys(problem["msg"].lower().removeprefix("input ") for problem in problems)
         raise SdfhubError(f"{key}={value!r}: {' or '.join(wanted)}") from error

@@ -58,8 +58,7 @@ def unpack(archive: Path, folder: Path, suffix: str) -> None:
         if process.returncode:
             raise ValueError(f"dpkg-deb ended with status {process.returncode}")
     except (tarfile.TarError, ValueError) as error:
-        what = f"{archive}: not a whole .deb ({error}); delete it and download it again"
-        raise SdfhubError(what) from error
+        raise SdfhubError(f"{archive}: not a whole .deb ({error}); delete it and fetch it again") from error
     if not total:
         raise SdfhubError(f"{archive}: holds no {suffix} files; is it the right package?")
 

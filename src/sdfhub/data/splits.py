@@ -1,6 +1,7 @@
 """Which shapes are trained on and which are held out."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable
 from itertools import chain, zip_longest
 from typing import NamedTuple
@@ -39,12 +40,10 @@ def split(shapes: list[Shape], train: int | None, held_out: int, seed: int, at_m
     rest = [shape for shape in _evenly(reversed(pool)) if shape.id not in taken]
     is_short = len(chosen) < held_out or len(rest) < (train or 0)
     if (is_short and not at_most) or (not rest and train != 0):
-        roles = [shape.split for shape in shapes]
-        given = f" ({roles.count('train')} train and {roles.count('held_out')} held out by the split file)"
+        roles = Counter(shape.split for shape in shapes if shape.split)
+        given = f" ({roles['train']} train and {roles['held_out']} held out by the split file)"
         asked = f"{'all others' if train is None else train} to train on and {held_out} to hold out"
-        raise SdfhubError(
-            f"too few shapes: {asked} are asked for, there are {len(shapes)}{given if any(roles) else ''}"
-        )
+        raise SdfhubError(f"too few shapes: {asked} wanted, there are {len(shapes)}{given if roles else ''}")
     return Split(train=rest[:train], held_out=chosen)
 
 

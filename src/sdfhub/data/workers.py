@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import resource_tracker
 from typing import Any
@@ -19,13 +18,11 @@ from loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 # what tells the numeric libraries how many threads to start; read when they are imported
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing modules of the current folder
+Numbered = Iterator[tuple[int, Any]]  # items or their results, with the index of the item
+Crashed = BrokenProcessPool  # an item's result if its worker died: out of memory, a fault in a native library
 
 
-class Crashed:
-    """The result of an item whose worker process died (out of memory, a fault in a native library)."""
-
-
-def map_in_processes(function: Callable, items: Iterable, workers: int) -> Iterator[tuple[int, Any]]:
+def map_in_processes(function: Callable, items: Iterable, workers: int) -> Numbered:
     """(index, function(item)) of each item, in the order in which they end; `Crashed` where a worker died.
 
     Function and items are picklable; exceptions are raised here. A worker has one thread. Items are taken
@@ -43,17 +40,16 @@ def map_in_processes(function: Callable, items: Iterable, workers: int) -> Itera
             for index, item in waiting.items():
                 try:
                     yield from _in_pool(function, iter([(index, item)]), {}, 1)
-                except BrokenProcessPool:
-                    yield index, Crashed()
+                except BrokenProcessPool as error:
+                    yield index, error
             waiting = {}
 
 
-def _in_pool(
-    function: Callable, items: Iterator[tuple[int, Any]], waiting: dict[int, Any], workers: int
-) -> Iterator[tuple[int, Any]]:
+def _in_pool(function: Callable, items: Numbered, waiting: dict[int, Any], workers: int) -> Numbered:
     """Results as `map_in_processes` gives them; `waiting` has the items without a result."""
     futures: dict[Future, int] = {}
-    with _pool(function, workers) as pool:
+    pool = _pool(function, workers)
+    try:
         while True:
             for index, item in islice(items, 2 * workers + 1 - len(futures)):
                 waiting[index] = item
@@ -64,10 +60,11 @@ def _in_pool(
                 index, result = futures.pop(future), future.result()
                 del waiting[index]
                 yield index, result
+    finally:
+        pool.shutdown(kill_workers=True)
 
 
-@contextmanager
-def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
+def _pool(function: Callable, workers: int) -> ProcessPoolExecutor:
     before = os.environ.pop(SAFE_PATH, None)
     os.environ[SAFE_PATH] = "1"  # for the processes that clean up after the workers; started once
     resource_tracker.ensure_running()
@@ -75,10 +72,7 @@ def _pool(function: Callable, workers: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(workers, env=env, initializer=_start, initargs=arguments)
     del os.environ[SAFE_PATH]
     os.environ |= {SAFE_PATH: before} if before is not None else {}
-    try:
-        yield pool
-    finally:
-        pool.shutdown(kill_workers=True)
+    return pool
 
 
 _function: Callable  # of a worker process: handed over once, since a source with its files may be large

@@ -11,6 +11,7 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.shapes import Observation
 
 Shapes = Sequence[Observation]
+Poses = PoseRange | None  # None where frames are known
 
 
 class Fitted(NamedTuple):
@@ -29,12 +30,7 @@ class Fit(Protocol):
         """Signed samples that an observation of a stored shape should hold; None for all there are."""
 
     def __call__(
-        self,
-        decoder: Decoder,
-        codes: Tensor,
-        observations: Shapes,
-        delta: float,
-        poses: PoseRange | None = None,
+        self, decoder: Decoder, codes: Tensor, observations: Shapes, delta: float, poses: Poses = None
     ) -> Fitted:
         """The shapes behind B observations, each fitted as if it were alone.
 

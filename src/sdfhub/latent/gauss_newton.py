@@ -67,8 +67,7 @@ class GaussNewtonFit:
             def fit(group: Shapes) -> list[Tensor]:
                 prior = [0 if shape.is_exact else 1 + shape.partial for shape in group]
                 rows = Rows.of(group, self.smallest, prior, codes.device)
-                few = not any(prior)
-                starts = (blind[:1], min(1, self.nearest)) if few else (blind, self.nearest)
+                starts = (blind, self.nearest) if any(prior) else (blind[:1], min(1, self.nearest))
                 return self._fit(problem, codes, *starts, rows)
 
             fitted, residuals, *pose = in_groups(fit, observations, codes.device)
@@ -151,14 +150,12 @@ class GaussNewtonFit:
         return Descents(shape, turn, unknowns, damping), here[0]
 
 
-def in_groups(
-    fit: Callable[[Shapes], list[Tensor]], observations: Shapes, device: torch.device
-) -> list[Tensor]:
+def in_groups(fit: Callable[[Shapes], list[Tensor]], shapes: Shapes, device: torch.device) -> list[Tensor]:
     """What a fit finds: on a CPU one by one, so that no neighbour changes a rounding, else by size."""
     groups: dict[int, list[int]] = {}
-    for row, observation in enumerate(observations):
-        groups.setdefault(row if device.type == "cpu" else len(observation.points), []).append(row)
-    work = [[observations[row] for row in rows] for rows in groups.values()]
+    for row, shape in enumerate(shapes):
+        groups.setdefault(row if device.type == "cpu" else len(shape.points), []).append(row)
+    work = [[shapes[row] for row in rows] for rows in groups.values()]
     parts = side_by_side(fit, work, least=1) if device.type == "cpu" else map(fit, work)
     order = torch.tensor([row for rows in groups.values() for row in rows]).argsort()
     return [torch.cat(column)[order] for column in zip(*parts, strict=True)]

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from sdfhub.latent.fitting import Poses, Shapes
 from sdfhub.latent.gaussian import Gaussian
-from sdfhub.latent.similarity import SIZE, PoseRange, small_similarity, turns
+from sdfhub.latent.similarity import SIZE, small_similarity, turns
 from sdfhub.model.decoder import Decoder
-from sdfhub.shapes import Observation
 
 ROWS_AT_ONCE = 2**12  # rows differentiated at a time on a CPU, by each thread; bounds memory
 
@@ -37,12 +37,9 @@ class Rows(NamedTuple):
     prior: Tensor  # [B] number of the shape's prior in the problem
 
     @classmethod
-    def of(
-        cls, observations: Sequence[Observation], smallest: float, prior: Sequence[int], device: torch.device
-    ) -> "Rows":
+    def of(cls, observations: Shapes, smallest: float, prior: Sequence[int], device: torch.device) -> "Rows":
         """B observations of equally many points; `soft` is their noise, at least `smallest`."""
-        names = ("points", "low", "high", "unsigned")
-        parts = [np.stack([getattr(shape, name) for shape in observations]) for name in names]
+        parts = [np.stack([getattr(shape, name) for shape in observations]) for name in cls._fields[:4]]
         soft = torch.tensor([max(smallest, shape.noise) for shape in observations])
         rows = *map(torch.from_numpy, parts), soft, torch.tensor(prior)
         return cls(*(part.to(device) for part in rows))
@@ -71,9 +68,7 @@ class Problem:
     which one a shape has; the decoder is in evaluation mode.
     """
 
-    def __init__(
-        self, decoder: Decoder, priors: list[tuple[Gaussian, float]], delta: float, poses: PoseRange | None
-    ):
+    def __init__(self, decoder: Decoder, priors: list[tuple[Gaussian, float]], delta: float, poses: Poses):
         self.decoder, self.delta, self.has_pose = decoder, delta, poses is not None
         like = priors[0][0].mean
         self.size = len(like)

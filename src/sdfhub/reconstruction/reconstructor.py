@@ -100,7 +100,13 @@ class Reconstructor:
     def meshes(self, scans: Sequence[ObservedScan], fitted: Fitted) -> Iterator[tuple[Mesh, np.ndarray]]:
         """Meshes in the scans' own frames, and the matrices [4, 4] from the normalised frame to these."""
         for row, mesh in enumerate(self.space.meshes(fitted.codes, self.resolution)):
-            matrix = to_scan(scans[row], fitted, row)
+            observed_to_scan, pose = np.eye(4), np.eye(4)
+            frame = scans[row].frame
+            observed_to_scan[:3] = np.column_stack([np.eye(3) / frame.scale, frame.center])
+            if fitted.poses is not None:
+                scale, rotation, shift = (part[row].double().cpu().numpy() for part in fitted.poses)
+                pose[:3] = np.column_stack([scale * rotation, shift])
+            matrix = observed_to_scan @ np.linalg.inv(pose)
             yield Mesh(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.faces), matrix
 
     def reconstruct(
@@ -125,29 +131,14 @@ class Reconstructor:
         near = self.poses.holds(fitted.poses) if self.poses and fitted.poses else [True] * len(group)
         for row, (mesh, matrix) in enumerate(self.meshes(scans, fitted)):
             name, kind = list(group)[row], ScanKind.of(scans[row])
-            result = Result(
-                name,
-                kind=str(kind),
-                residual=float(fitted.residuals[row]),
-                doubt=float(doubts[row]),
-                code=tuple(fitted.codes[row].tolist()),
-                frame=tuple(map(tuple, matrix.tolist())),
-                mesh=f"{name}.ply" if len(mesh.faces) else None,
-            )
+            residual, doubt = float(fitted.residuals[row]), float(doubts[row])
+            code, frame = tuple(fitted.codes[row].tolist()), tuple(map(tuple, matrix.tolist()))
+            file = f"{name}.ply" if len(mesh.faces) else None
+            result = Result(name, str(kind), residual, doubt, code=code, frame=frame, mesh=file)
             results.append(result.judged(limits.get(kind), bool(near[row])))
             write_mesh(*mesh, out / f"{name}.ply")  # before: a result is whole when it is described
             results[-1].write(out)
         return results
-
-
-def to_scan(scan: ObservedScan, fitted: Fitted, row: int) -> np.ndarray:
-    """[4, 4] float64 matrix from the normalised frame to that of a scan."""
-    observed_to_scan, pose = np.eye(4), np.eye(4)
-    observed_to_scan[:3] = np.column_stack([np.eye(3) / scan.frame.scale, scan.frame.center])
-    if fitted.poses is not None:
-        scale, rotation, shift = (part[row].double().cpu().numpy() for part in fitted.poses)
-        pose[:3] = np.column_stack([scale * rotation, shift])
-    return observed_to_scan @ np.linalg.inv(pose)
 
 
 def is_result(path: Path) -> bool:

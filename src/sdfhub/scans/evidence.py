@@ -33,9 +33,7 @@ class Evidence:
     rows: Annotated[int, Field(ge=4)] = 8192  # N, bounded points of an observation
     samples: Annotated[int, Field(ge=4)] = 16384  # the same of signed samples: as many as `evaluate` fits
     surface: Share = 0.25  # of them on the surface
-    uniform: Share = (
-        0.15  # of them, as far as the surface leaves any, in the cube, or where a sensor saw it empty
-    )
+    uniform: Share = 0.15  # of them, as far as the surface leaves any, in the cube or where it was seen empty
     variances: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (0.005, 0.0005)  # of near ones
     cells: Annotated[int, Field(ge=8)] = 64  # along an axis of the grid of empty space
     certain: Annotated[float, Field(ge=0, lt=0.5)] = 0.2  # distance of the winding number from 1/2 for a sign
@@ -56,7 +54,7 @@ class Evidence:
         A place is at most as far as the nearest point, and at least as far as tangent planes there or what
         the gaps between points leave. Its side: by the winding number with normals, without them by a flood.
         """
-        (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
+        noise, spacing, tree = self._measured(points)
         uniform, near = self._counts()
         deviation = np.sqrt(self.variances)[np.arange(near) % len(self.variances), None]
         at = points[rng.integers(len(points), size=near)] + deviation * rng.standard_normal((near, 3))
@@ -83,11 +81,21 @@ class Evidence:
         Free space is at least as far from surfaces as from space not known to be free, and at most as far as
         from the nearest seen point. Beside seen points, the side of the sensor is outside.
         """
-        (noise, spacing), tree = self._noise_and_spacing(points), cKDTree(points)
-        beside, steps = self._beside(points, normals, sensor, max(2 * spacing, 3 * noise), tree, rng)
+        noise, spacing, tree = self._measured(points)
+        uniform, near = self._counts()
+        flat = np.arange(len(points))
+        if normals is None:
+            normals, scatter = tangent_planes(points)  # to be trusted on the flatter half
+            flat = np.flatnonzero(scatter <= np.median(scatter))
+        away = np.einsum("ij,ij->i", normals, points - sensor) > 0
+        normals = np.where(away[:, None], -normals, normals)
+        steps = max(2 * spacing, 3 * noise) * np.repeat([1, -1], len(flat))
+        beside = np.tile(points[flat], (2, 1)) + steps[:, None] * np.tile(normals[flat], (2, 1))
+        own = np.flatnonzero(tree.query(beside)[1] == np.tile(flat, 2))
+        own = rng.choice(own, near) if len(own) else own
+        beside, steps = beside[own], steps[own]
         slack = np.where(steps > 0, noise, np.abs(steps))  # the part may be thin behind its face
         empty, clear = free_space(points, sensor, self.cells, self.background)
-        uniform, _ = self._counts()
         rows = rng.integers(len(empty), size=uniform) if len(empty) else np.zeros(0, np.int64)
         at = np.concatenate([beside, empty[rows]])
         low = np.concatenate([steps - slack, clear[rows]])
@@ -95,24 +103,10 @@ class Evidence:
         bounds = at, np.minimum(low, high), high, np.zeros(len(at), bool)
         return replace(self._with_surface(points, bounds, noise, rng), partial=True)
 
-    def _beside(self, points, normals, sensor, step: float, tree, rng) -> tuple[np.ndarray, np.ndarray]:
-        """Places [Q, 3] a step before and behind seen points, and the signed steps [Q]."""
-        flat = np.arange(len(points))
-        if normals is None:
-            normals, scatter = tangent_planes(points)  # to be trusted on the flatter half
-            flat = np.flatnonzero(scatter <= np.median(scatter))
-        away = np.einsum("ij,ij->i", normals, points - sensor) > 0
-        normals = np.where(away[:, None], -normals, normals)
-        steps = np.repeat([step, -step], len(flat))
-        beside = np.tile(points[flat], (2, 1)) + steps[:, None] * np.tile(normals[flat], (2, 1))
-        own = np.flatnonzero(tree.query(beside)[1] == np.tile(flat, 2))
-        own = rng.choice(own, self._counts()[1]) if len(own) else own
-        return beside[own], steps[own]
-
-    def _noise_and_spacing(self, points: np.ndarray) -> tuple[float, float]:
-        """Of points [M, 3]; no noise where there is hardly any."""
-        noise, spacing = noise_of(points), float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
-        return (noise if noise > self.quiet else 0.0), spacing
+    def _measured(self, points: np.ndarray) -> tuple[float, float, cKDTree]:
+        """Noise of points [M, 3], none where there is hardly any, their spacing, and a tree of them."""
+        noise, tree = noise_of(points), cKDTree(points)
+        return noise if noise > self.quiet else 0.0, float(np.median(tree.query(points, 2)[0][:, 1])), tree
 
     def _counts(self) -> tuple[int, int]:
         """How many rows lie anywhere, and near the surface."""

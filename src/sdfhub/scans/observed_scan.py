@@ -76,14 +76,9 @@ def _observe_mesh(scan: Scan, faces, evidence: Evidence, frame: ScanFrame, rng) 
 
 def observations_of(shapes: Sequence[StoredShape], samples: int | None, seeds: Sequence[int]) -> list:
     """Observations of so many signed samples of each shape by a seed of its own; None for all samples."""
-    observations = []
-    for shape, seed in zip(shapes, seeds, strict=True):
-        if samples is None:
-            rows = np.concatenate([shape.read("outside"), shape.read("inside")])
-        else:
-            rows = signed_samples(shape, samples, np.random.default_rng(seed))
-        observations.append(Observation.of_samples(rows[:, :3], rows[:, 3]))
-    return observations
+    pairs = zip(shapes, map(np.random.default_rng, seeds), strict=True)
+    drawn = [signed_samples(shape, samples, rng) for shape, rng in pairs]
+    return [Observation.of_samples(rows[:, :3], rows[:, 3]) for rows in drawn]
 
 
 def _refuse_misplaced(points: np.ndarray, largest: float) -> None:

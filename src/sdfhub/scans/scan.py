@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfhub.data.sources import mesh_files
 from sdfhub.data.sources.deepsdf import npz_array, read_samples
-from sdfhub.data.sources.mesh_files import FORMATS as MESHES
-from sdfhub.data.sources.mesh_files import MAX_BYTES, check_length, read_mesh
-from sdfhub.errors import RejectedMesh, SdfhubError
+from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Frame
 
-FORMATS = (*MESHES, ".xyz", ".npy", ".npz")
+FORMATS = (*mesh_files.FORMATS, ".xyz", ".npy", ".npz")
 LEAST = 50  # points from which a shape may be guessed
 _PARTS = {"points", "sdf", "normals", "sensor", "center", "scale"}
 
@@ -72,8 +71,8 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: not a format of scans known here ({' '.join(FORMATS)})")
     if not path.is_file():
         raise SdfhubError(f"{path}: no such file")
-    if path.stat().st_size > MAX_BYTES:
-        raise SdfhubError(f"{path}: larger than {MAX_BYTES >> 20} MiB; thin it out first")
+    if path.stat().st_size > mesh_files.MAX_BYTES:
+        raise SdfhubError(f"{path}: larger than {mesh_files.MAX_BYTES >> 20} MiB; thin it out first")
     # mapped, a header that claims more than the file fails
     load_array = partial(np.load, mmap_mode="r", allow_pickle=False)
     readers: dict[str, Callable] = {".xyz": np.loadtxt, ".npy": load_array, ".ply": _ply_rows}
@@ -83,11 +82,13 @@ def read_scan(path: str | Path) -> Scan:
         header = path.read_bytes().partition(b"end_header")[0] if suffix == ".ply" else b""
         has_faces = re.search(rb"^element\s+(?:face|tristrips)\s+[1-9]", header, re.MULTILINE)
         if suffix in readers and not has_faces:
-            return _cloud(readers[suffix](path))
-        mesh = read_mesh(path)
-        return Scan(mesh[0], faces=mesh[1])
-    except RejectedMesh as rejection:
-        raise SdfhubError(rejection.detail) from rejection
+            rows = readers[suffix](path)
+            if rows.ndim != 2 or rows.shape[1] not in (3, 6):
+                raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
+            rows = rows.astype(np.float64)
+            return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
+        mesh = mesh_files.read_mesh(path)
+        return Scan(mesh.vertices, faces=mesh.faces)
     except SdfhubError:
         raise
     except Exception as error:  # the readers raise whatever broken bytes lead to
@@ -95,19 +96,12 @@ def read_scan(path: str | Path) -> Scan:
         raise SdfhubError(f"{path}: {reason}") from error
 
 
-def _cloud(rows: np.ndarray) -> Scan:
-    if rows.ndim != 2 or rows.shape[1] not in (3, 6):
-        raise ValueError(f"expected rows x y z or x y z nx ny nz, got an array {list(rows.shape)}")
-    rows = rows.astype(np.float64)
-    return Scan(rows[:, :3], rows[:, 3:] if rows.shape[1] == 6 else None)
-
-
 def _ply_rows(path: Path) -> np.ndarray:
     import trimesh  # here: slow to import
 
     try:
         content = path.read_bytes()
-        check_length(content, ".ply")
+        mesh_files.check_length(content, ".ply")
         cloud = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
         columns = cloud.metadata["_ply_raw"]["vertex"]["data"]
         names = columns.dtype.names if hasattr(columns, "dtype") else columns
@@ -126,8 +120,7 @@ def _archive(path: Path) -> Scan:
         points, sdf = samples.points.astype(np.float64), samples.sdf.astype(np.float64)
         return Scan(points, sdf=sdf, frame=samples.frame)
     if "points" not in names:
-        contents = ", ".join(sorted(names)) or "nothing"
-        raise ValueError(f"holds {contents}; expected pos and neg, points and sdf, or points")
+        raise ValueError(f"holds {', '.join(sorted(names)) or 'nothing'}; expected points, or pos and neg")
     parts = {name: npz_array(path, name).astype(np.float64) for name in names & _PARTS}
     if "sdf" not in parts:
         return Scan(parts["points"], parts.get("normals"), sensor=parts.get("sensor"))

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from sdfhub.data.store.store import shape_seed
-from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.data.store.stored_shape import StoredShape, signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.render import seen_from
 from sdfhub.geometry.surface_sampling import sample_surface
@@ -57,7 +57,7 @@ class ScanKind:
         """A simulated scan of a shape, in the normalised frame, by its number."""
         rng = np.random.default_rng([shape_seed(shape), number])
         if self.kind == "samples":
-            rows = np.concatenate([shape.read("outside"), shape.read("inside")]).astype(np.float64)
+            rows = signed_samples(shape, None, rng).astype(np.float64)
             return Scan(rows[:, :3], sdf=rows[:, 3])
         if shape.mesh is None:
             raise SdfhubError(f"the run's data has no meshes, so that no scan ({self}) can be simulated")

@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 
 from sdfhub.composition import instantiate, plain
 from sdfhub.data.loading import SdfDataModule
-from sdfhub.data.sources import Source
+from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.described import check
 from sdfhub.errors import SdfhubError

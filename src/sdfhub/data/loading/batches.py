@@ -82,15 +82,21 @@ class StepBatches(Dataset):
         samples = np.empty((len(rows), loading.samples_per_shape, 4), np.float32)
         surface = np.empty((len(rows), loading.surface_per_shape, 6), np.float32)
         for row, points, oriented in zip(rows, samples, surface, strict=True):
-            copy, index = divmod(int(row), len(self.shapes))
-            rng = self.generator(step, row)
-            signed_samples(self.shapes[index], len(points), rng, points)
-            draw_rows(oriented, self.shapes[index], "surface", rng)
-            if copy:
-                of_samples, of_surface = loading.augmentation.factors(copy, int(row), loading.seed)
-                points *= of_samples
-                oriented *= of_surface
-        return batch_of(*map(torch.from_numpy, (rows, samples, surface)))
+            shape, rng = self.shapes[row % len(self.shapes)], self.generator(step, row)
+            signed_samples(shape, len(points), rng, points)
+            draw_rows(oriented, shape, "surface", rng)
+        return self.batch_of(rows, torch.from_numpy(samples), torch.from_numpy(surface))
+
+    def batch_of(self, rows: np.ndarray, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
+        """The batch of rows [B], from samples [B, N, 4] and oriented points [B, M, 6] of their shapes."""
+        if (augmentation := self.loading.augmentation).copies:
+            copies = zip((rows // len(self.shapes)).tolist(), rows.tolist(), strict=True)
+            factors = [augmentation.factors(copy, row, self.loading.seed) for copy, row in copies]
+            of_samples, of_surface = (np.stack(part)[:, None] for part in zip(*factors, strict=True))
+            samples *= torch.from_numpy(of_samples).to(samples.device)
+            surface *= torch.from_numpy(of_surface).to(surface.device)
+        here = torch.from_numpy(rows).to(samples.device)
+        return Batch(here, samples[..., :3], samples[..., 3], surface[..., :3], surface[..., 3:])
 
     def rows_of(self, step: int) -> np.ndarray:
         """[B] int64 rows of the code table that a step sees, of them this process's share."""
@@ -115,11 +121,8 @@ class ResidentBatches(StepBatches):
     def __init__(self, shapes: Sequence[StoredShape], loading: Loading, device: torch.device):
         super().__init__(shapes, loading)
         self.device, inside = device, loading.samples_per_shape // 2
-        self.wanted = {"outside": loading.samples_per_shape - inside, "inside": inside}
-        self.wanted["surface"] = loading.surface_per_shape
-        for shape in shapes:
-            for name, count in self.wanted.items():
-                refuse_empty(shape, name, count)
+        outside = loading.samples_per_shape - inside
+        self.wanted = {"outside": outside, "inside": inside, "surface": loading.surface_per_shape}
         self.counts = {name: np.array([shape.rows(name) for shape in shapes]) for name in EXTENT}
         self.first = {name: np.cumsum([0, *counts]) for name, counts in self.counts.items()}
         self.tables = {name: self._table(name) for name in EXTENT}
@@ -129,40 +132,27 @@ class ResidentBatches(StepBatches):
         first = self.first[name]
         table = torch.empty((int(first[-1]), COLUMNS[name]), dtype=torch.int16, device=self.device)
         for index, shape in enumerate(self.shapes):
-            array = torch.from_numpy(shape.read(name, 0, shape.rows(name)))
+            refuse_empty(shape, name, self.wanted[name])
+            array = torch.from_numpy(shape.read(name))
             if len(array) and (reach := array[:, :3].abs().max()) > EXTENT[name]:
-                what = f"has points up to {reach:.3g} from 0 along an axis"
-                raise SdfhubError(f"{shape.id}: {what}; train with data.loader.resident=false")
+                raise SdfhubError(f"{shape.id}: reaches {reach:.3g}; train with data.loader.resident=false")
             fractions = (array / EXTENT[name]).clamp(-1, 1).mul(32767).round().to(torch.int16)
             table[first[index] : first[index + 1]] = fractions.to(self.device)
         return table
 
     def __getitem__(self, step: int) -> Batch:
-        rows, loading = self.rows_of(step), self.loading
-        copies, shapes = np.divmod(rows, len(self.shapes))
-        starts = np.zeros((3, len(rows)), np.int64)
+        rows = self.rows_of(step)
+        shapes, starts = rows % len(self.shapes), np.zeros((3, len(rows)), np.int64)
         for column, (row, shape) in enumerate(zip(rows, shapes, strict=True)):
             rng = self.generator(step, row)
             for line, name in enumerate(EXTENT):
                 starts[line, column] = rng.integers(self.counts[name][shape]) if self.wanted[name] else 0
         outside, inside, surface = map(self._gathered, EXTENT, [shapes] * 3, starts)
-        samples = torch.cat([outside, inside], dim=1)
-        if loading.augmentation.copies:
-            factors = map(loading.augmentation.factors, copies, rows.tolist(), [loading.seed] * len(rows))
-            of_samples, of_surface = (self._moved(np.stack(part)) for part in zip(*factors, strict=True))
-            samples, surface = samples * of_samples[:, None], surface * of_surface[:, None]
-        return batch_of(self._moved(rows), samples, surface)
-
-    def _moved(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array).to(self.device)
+        return self.batch_of(rows, torch.cat([outside, inside], dim=1), surface)
 
     def _gathered(self, name: str, shapes: np.ndarray, start: np.ndarray) -> torch.Tensor:
         """[B, n, C] consecutive rows, wrapping within each shape, as float32."""
-        first, rows, begin = map(self._moved, (self.first[name][shapes], self.counts[name][shapes], start))
+        places = self.first[name][shapes], self.counts[name][shapes], start
+        first, rows, begin = (torch.from_numpy(array).to(self.device) for array in places)
         steps = begin[:, None] + torch.arange(self.wanted[name], device=self.device)
         return self.tables[name][first[:, None] + steps % rows[:, None].clamp(min=1)] * (EXTENT[name] / 32767)
-
-
-def batch_of(rows: torch.Tensor, samples: torch.Tensor, surface: torch.Tensor) -> Batch:
-    """A batch from its rows [B], samples [B, N, 4] and oriented surface points [B, M, 6]."""
-    return Batch(rows, samples[..., :3], samples[..., 3], surface[..., :3], surface[..., 3:])

@@ -16,7 +16,6 @@ from sdfhub.data.preparation.settings import DEFAULT, Preparation
 from sdfhub.data.sources.source import Source
 from sdfhub.data.splits import Split, split
 from sdfhub.data.store import store as stores
-from sdfhub.data.store.store import Store
 from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.errors import SdfhubError
 
@@ -84,26 +83,23 @@ class SdfDataModule(L.LightningDataModule):
         """The source's shapes by role; none is prepared for it."""
         offered = self.source.shapes()
         roles = split(offered, self.shapes, self.held_out, self.split_seed, self.source.is_collection)
-        train, held_out = map(len, roles)
-        left_out = len(offered) - train - held_out
+        there, (train, held_out) = len(offered), map(len, roles)
+        left_out = there - train - held_out
         if self.source.is_collection and (left_out or (train, held_out) != (self.shapes, self.held_out)):
-            asked = f"data.shapes={'null' if self.shapes is None else self.shapes}"
-            log.info(
-                f"data: {self.source.label}: of {len(offered)} shapes {train} are trained on, {held_out} "
-                f"held out, {left_out} left out ({asked} and data.held_out={self.held_out} are upper bounds)"
-            )
+            counts = f"of {there} shapes {train} are trained on, {held_out} held out, {left_out} left out"
+            wanted = f"data.shapes={self.shapes or 'null'} and data.held_out={self.held_out}"
+            log.info(f"data: {self.source.name}: {counts} ({wanted} are upper bounds)")
         return roles
 
     def prepared(self, roles: Split) -> tuple[list[StoredShape], list[StoredShape]]:
         """The stored shapes of both roles; missing ones are prepared, rejected ones left out."""
         store = self.filled(roles)
         train, held_out = ([store[s.id] for s in part if s.id in store] for part in roles)
-        what = f"{len(train)} shapes to train on, {len(held_out)} held out, {len(store.rejected)} rejected"
-        log.info(f"data: {self.source.name}: {what}")
+        log.info(f"data: {self.source.name}: {len(train)} shapes to train on, {len(held_out)} held out")
         log.info(f"store: {store.folder}: {store.summary()}")
         return train, held_out
 
-    def filled(self, roles: Split) -> Store:
+    def filled(self, roles: Split) -> stores.Store:
         """The store with the shapes of both roles."""
         shapes = roles.train + roles.held_out
         return stores.prepare(self.source, shapes, self.preparation, Path(self.store), self.workers)
@@ -123,17 +119,16 @@ class SdfDataModule(L.LightningDataModule):
         if self.train_shapes:
             return
         if self.loader.surface_per_shape and not self.source.has_normals:
-            what = f"the files of data={self.source.name} carry none; train with normals=off"
-            raise SdfhubError(f"normals=on: {what}")
+            raise SdfhubError(f"normals=on: the files of data={self.source.name} carry none; use normals=off")
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
-        if not self.train_shapes:
-            raise SdfhubError("data: every shape that was to be trained on was rejected; see the log")
 
     @cached_property
     def batches(self) -> StepBatches:
         """Training batches by step, after `setup`."""
         if not self.train_shapes:
-            raise SdfhubError("SdfDataModule: call prepare_data() and setup() first")
+            raise SdfhubError(
+                "data: no shapes: call prepare_data() and setup() first, or see why all were rejected"
+            )
         return StepBatches(self.train_shapes, self.loader)
 
     @property
@@ -151,13 +146,9 @@ class SdfDataModule(L.LightningDataModule):
         if trainer:
             self.batches.share(trainer.global_rank, trainer.world_size)
             done = lambda: trainer.global_step * trainer.accumulate_grad_batches  # noqa: E731
-        return DataLoader(
-            self.batches,
-            sampler=EpochSteps(len(self.batches), done),
-            batch_size=None,
-            num_workers=0 if resident else self.loader.workers,
-            persistent_workers=False,  # a worker of the last epoch would not hear of the next
-        )
+        steps, workers = EpochSteps(len(self.batches), done), 0 if resident else self.loader.workers
+        # workers do not persist: one of the last epoch would not hear of the next
+        return DataLoader(self.batches, sampler=steps, batch_size=None, num_workers=workers)
 
     def val_dataloader(self) -> DataLoader:
         """Yields a few `ValidationShape`, held-out ones first."""

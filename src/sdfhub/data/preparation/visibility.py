@@ -62,18 +62,15 @@ def sightings(mesh: NormalizedMesh, views: int, rng: np.random.Generator) -> np.
     scene = EmbreeScene()
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
 
-    def look(
-        faces: np.ndarray, rays: np.ndarray
-    ) -> None:  # [S] rows, and the number of rays for each of them
+    def look(faces: np.ndarray, rays: np.ndarray) -> None:  # [S] rows, and the number of rays for each
         starts = np.cumsum(rays) - rays
         row = np.repeat(turn[faces] - starts, rays) + np.arange(rays.sum())
         direction = directions[row % len(directions)]
         origins = points_on_faces(corners, np.repeat(faces, rays), rng) + np.float32(TOUCH) * direction
         cosine = np.einsum("nj,nj->n", np.repeat(normals[faces], rays, axis=0), direction)
         seen = np.where(scene.run(origins, direction, query="OCCLUDED") < 0, cosine, 0)
-        for total, weight in zip(
-            sums, (np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine)), strict=True
-        ):
+        weights = np.maximum(seen, 0), np.maximum(-seen, 0), np.abs(cosine)
+        for total, weight in zip(sums, weights, strict=True):
             total[faces] += np.add.reduceat(weight, starts)
         turn[faces] += rays
 

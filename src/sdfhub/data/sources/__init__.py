@@ -5,5 +5,3 @@ from sdfhub.data.sources.folder import FolderSource as FolderSource
 from sdfhub.data.sources.folder import ShapeNetSource as ShapeNetSource
 from sdfhub.data.sources.open import OpenSource as OpenSource
 from sdfhub.data.sources.procedural import ProceduralSource as ProceduralSource
-from sdfhub.data.sources.source import Shape as Shape
-from sdfhub.data.sources.source import Source as Source

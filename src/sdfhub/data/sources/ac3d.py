@@ -22,8 +22,8 @@ def read_ac3d(content: bytes) -> Mesh:
     vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
     above: list[tuple[int, np.ndarray, np.ndarray]] = []  # kids that are to come, rotation, origin
     try:
-        while words := reader.words():  # many files announce more kids than they hold
-            if words[0] == "OBJECT":
+        for line in reader:  # many files announce more kids than they hold
+            if line.split()[:1] == [b"OBJECT"]:
                 while above and above[-1][0] <= 0:
                     above.pop()
                 left, outer, place = above.pop() if above else (0, np.eye(3), np.zeros(3))
@@ -40,24 +40,19 @@ def read_ac3d(content: bytes) -> Mesh:
 
 
 class _Lines(io.BytesIO):
-    """Lines of the file as lists of words."""
-
     def words(self) -> list[str]:
-        """Those of the next line that is not blank; none at the end."""
-        return next((words for line in self if (words := line.decode("latin-1").split())), [])
-
-    def line(self) -> list[str]:
-        """Those of a line that must be there."""
-        if not (words := self.words()):
-            raise ValueError("the file ends in the middle of an object")
-        return words
+        """Those of the next line that is not blank."""
+        for line in self:
+            if words := line.decode("latin-1").split():
+                return words
+        raise ValueError("the file ends in the middle of an object")
 
 
 def _object(reader: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
     """Vertices [V, 3] and faces [F, 3] of an object, its rotation from the left, its place, and its kids."""
     rotation, location, vertices = np.eye(3), np.zeros(3), np.zeros((0, 3))
     triangles: list[tuple[int, int, int]] = []
-    while (words := reader.line())[0] != "kids":
+    while (words := reader.words())[0] != "kids":
         match words[0]:
             case "rot":
                 rotation = np.array(words[1:10], dtype=np.float64).reshape(3, 3)
@@ -66,7 +61,7 @@ def _object(reader: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
             case "data":
                 reader.read(int(words[1]) + 1)  # and the end of its line
             case "numvert":
-                rows = [reader.line()[:3] for _ in range(int(words[1]))]
+                rows = [reader.words()[:3] for _ in range(int(words[1]))]
                 vertices = np.array(rows, dtype=np.float64).reshape(len(rows), 3)
             case "numsurf":
                 triangles = [triangle for _ in range(int(words[1])) for triangle in _surface(reader)]
@@ -78,14 +73,14 @@ def _object(reader: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 def _surface(reader: _Lines) -> list[tuple[int, int, int]]:
     """The triangles of one surface; none for a line."""
-    kind, words = POLYGON, reader.line()
+    kind, words = POLYGON, reader.words()
     while words[0] != "refs":
         if words[0] == "SURF":
             kind = int(words[1], 16) & 15
         elif words[0] != "mat":
             raise ValueError(f"{words[0]!r} instead of a surface's refs")
-        words = reader.line()
-    corners = [int(reader.line()[0]) for _ in range(int(words[1]))]
+        words = reader.words()
+    corners = [int(reader.words()[0]) for _ in range(int(words[1]))]
     if kind == POLYGON:
         return [(corners[0], b, c) for b, c in pairwise(corners[1:])]
     if kind == STRIP:

@@ -16,49 +16,6 @@ REACH = 1.5  # along an axis: samples lie near shapes in the unit ball, or in th
 _SAMPLES, _PARAMETERS = "SdfSamples", "NormalizationParameters"
 
 
-class DeepSdfSource(SourceOfFiles):
-    """Every .npz with `pos` and `neg` ([n, 4] rows x, y, z, sdf) below a folder.
-
-    DeepSDF writes `SdfSamples/<dataset>/<class>/<id>.npz`; any tree will do. Where classes are named by a
-    synset of `categories`, only those categories are taken; otherwise all files are, and a file's folder
-    names its category. The files lie in the normalised frame and carry no surface normals and no mesh;
-    `NormalizationParameters/...` beside `SdfSamples` gives the way back to the source's frame.
-
-    Args:
-        root: the folder, searched with all below it.
-        categories: name -> {synset}, or None.
-        train_split, test_split: see `SourceOfFiles`.
-    """
-
-    has_normals = False
-    is_collection = True
-
-    def __init__(
-        self,
-        root: str,
-        categories: Mapping | None = None,
-        train_split: str | None = None,
-        test_split: str | None = None,
-    ):
-        super().__init__("deepsdf", root, train_split, test_split)
-        self.category_of = by_synset(categories)
-
-    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
-        files = [file for file in sorted(self.root.rglob("*.npz")) if _PARAMETERS not in file.parts]
-        if not files:
-            raise SdfhubError(f"data.source.root={self.root}: holds no .npz files with DeepSDF's samples")
-        files = [file for file in files if file.parent.name in self.category_of] or files
-        paths = {file: file.relative_to(self.root).with_suffix("").as_posix() for file in files}
-        ids = {file: shape_id(path, self.category_of, self.root.name) for file, path in paths.items()}
-        for id, file in sorted(unique_ids(ids, self.root).items()):
-            states = [part.stat() for part in (file, _frame_file(file)) if part]
-            fingerprint = " ".join(f"{state.st_size} {state.st_mtime_ns}" for state in states)
-            yield Shape(id, id.partition("/")[0], fingerprint), file, paths[file]
-
-    def read(self, file: Path) -> ShapeSamples:
-        return read_samples(file)
-
-
 def by_synset(categories: Mapping | None) -> dict[str, str]:
     """Category of each synset that the settings of categories name."""
     return {value["synset"]: name for name, value in (categories or {}).items() if value.get("synset")}
@@ -86,8 +43,7 @@ def read_samples(path: Path) -> ShapeSamples:
         raise RejectedMesh("one_sided_samples", f"{path}: {outside} samples outside, {inside} inside")
     rows = np.concatenate(parts)
     if (reach := np.abs(rows[:, :3]).max()) > REACH:
-        what = f"{path}: has points {reach:.3g} from 0 along an axis; in the normalised frame all are near 1"
-        raise RejectedMesh("wrong_frame", what)
+        raise RejectedMesh("wrong_frame", f"{path}: has points {reach:.3g} from 0 along an axis, not near 1")
     none, frame = np.zeros((0, 3), dtype=np.float32), frame_of(path) or NORMALIZED
     share = {"inside": inside / len(rows)}
     return ShapeSamples(rows[:, :3].copy(), rows[:, 3].copy(), none, none, frame, None, share)
@@ -127,3 +83,44 @@ def npz_array(path: Path, name: str) -> np.ndarray:
         raise
     except Exception as error:  # zip archives and numpy's headers break in many ways
         raise RejectedMesh("corrupt_file", f"{path}: {error}") from error
+
+
+class DeepSdfSource(SourceOfFiles):
+    """Every .npz with `pos` and `neg` ([n, 4] rows x, y, z, sdf) below a folder.
+
+    DeepSDF writes `SdfSamples/<dataset>/<class>/<id>.npz`; any tree will do. Where classes are named by a
+    synset of `categories`, only those categories are taken; otherwise all files are, and a file's folder
+    names its category. The files lie in the normalised frame and carry no surface normals and no mesh;
+    `NormalizationParameters/...` beside `SdfSamples` gives the way back to the source's frame.
+
+    Args:
+        root: the folder, searched with all below it.
+        categories: name -> {synset}, or None.
+        train_split, test_split: see `SourceOfFiles`.
+    """
+
+    read = staticmethod(read_samples)
+    has_normals = False
+    is_collection = True
+
+    def __init__(
+        self,
+        root: str,
+        categories: Mapping | None = None,
+        train_split: str | None = None,
+        test_split: str | None = None,
+    ):
+        super().__init__("deepsdf", root, train_split, test_split)
+        self.category_of = by_synset(categories)
+
+    def listed(self) -> Iterator[tuple[Shape, Path, str]]:
+        files = [file for file in sorted(self.root.rglob("*.npz")) if _PARAMETERS not in file.parts]
+        if not files:
+            raise SdfhubError(f"data.source.root={self.root}: holds no .npz files with DeepSDF's samples")
+        files = [file for file in files if file.parent.name in self.category_of] or files
+        paths = {file: file.relative_to(self.root).with_suffix("").as_posix() for file in files}
+        ids = {file: shape_id(path, self.category_of, self.root.name) for file, path in paths.items()}
+        for id, file in sorted(unique_ids(ids, self.root).items()):
+            states = [part.stat() for part in (file, _frame_file(file)) if part]
+            fingerprint = " ".join(f"{state.st_size} {state.st_mtime_ns}" for state in states)
+            yield Shape(id, id.partition("/")[0], fingerprint), file, paths[file]

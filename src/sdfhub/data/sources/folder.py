@@ -5,7 +5,7 @@ import json
 import os
 import re
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,6 +15,7 @@ from pydantic import BaseModel, StringConstraints
 from sdfhub.data.sources import source as sources
 from sdfhub.data.sources.mesh_files import FORMATS, buffer_names, buffer_path, read_mesh
 from sdfhub.data.sources.source import Shape, Source, folder_safe
+from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples
 from sdfhub.whole_file import file_sha256
@@ -25,11 +26,11 @@ LAYOUTS = ("models/model_normalized.obj", "model.obj")  # of a ShapeNet model's 
 class SourceOfFiles(Source):
     """A source of one file per shape below a root, named for `kind` and its root.
 
-    Args:
-        root: the folder that holds the files.
-        train_split, test_split: files that list the training and the held-out shapes; see `with_roles`. Where
-            either is given, unlisted shapes are left out. None lets a seed decide.
+    `train_split` and `test_split` are files that list the training and the held-out shapes; see `with_roles`.
+    Where either is given, unlisted shapes are left out. None lets a seed decide.
     """
+
+    read: Callable[[Path], Mesh | ShapeSamples] = staticmethod(read_mesh)  # what a shape's file holds
 
     def __init__(self, kind: str, root: str, train_split: str | None = None, test_split: str | None = None):
         self.root = Path(os.path.abspath(root))
@@ -41,10 +42,6 @@ class SourceOfFiles(Source):
     @abstractmethod
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         """Each shape by id with its file, and its path below the root as split files have it."""
-
-    def read(self, file: Path) -> Mesh | ShapeSamples:
-        """What a shape's file holds."""
-        return read_mesh(file)
 
     def shapes(self) -> list[Shape]:
         if not self.root.is_dir():
@@ -87,10 +84,6 @@ class FolderSource(SourceOfFiles):
         super().__init__("folder", root, train_split, test_split)
         self.up, self.categories = up, [str(name) for name in categories or ()]
 
-    @property
-    def label(self) -> str:
-        return folder_safe(self.root.resolve().name)
-
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         below = {path: path.relative_to(self.root).with_suffix("") for path in self.root.rglob("*")}
         meshes = (path for path in below if path.suffix.lower() in FORMATS and path.is_file())
@@ -104,9 +97,7 @@ class FolderSource(SourceOfFiles):
         for id, file in sorted(sources.unique_ids(ids, self.root).items()):
             category = id.partition("/")[0]
             if category in (self.categories or there):
-                # a name may hold bytes of another encoding, which JSON would not take
-                credits = {"title": os.fsencode(file.name).decode(errors="replace")}
-                yield Shape(id, category, _fingerprint(file), credits=credits), file, below[file].as_posix()
+                yield Shape(id, category, _fingerprint(file)), file, below[file].as_posix()
 
 
 def _id(path: Path) -> str:
@@ -146,7 +137,7 @@ class ShapeNetSource(SourceOfFiles):
         self, categories: Mapping, root: str, train_split: str | None = None, test_split: str | None = None
     ):
         super().__init__("shapenet", root, train_split, test_split)
-        self.categories = sorted(sources.checked_categories(categories, Category).items())
+        self.categories = sorted(check(categories, dict[str, Category], "category").items())
 
     def listed(self) -> Iterator[tuple[Shape, Path, str]]:
         for category, settings in self.categories:

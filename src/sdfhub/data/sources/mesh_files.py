@@ -130,12 +130,8 @@ def _by_trimesh(content: bytes, suffix: str, buffers: dict[str, bytes]) -> Mesh:
     import trimesh  # here: slow to import, and a training on a filled store reads no mesh file
 
     if suffix in (".obj", ".off"):  # names and comments may be in any encoding, numbers are the same in all
-        try:
-            content.decode()
-        except UnicodeDecodeError:
-            content = content.decode("latin-1").encode()
-    options = {"skip_materials": True} if suffix in (".obj", ".glb", ".gltf") else {}
+        content = content.decode(errors="replace").encode()
     file, kind = io.BytesIO(content), suffix[1:]
     with np.errstate(all="ignore"):  # it computes with infinite vertices, which are refused later
-        mesh = trimesh.load_mesh(file, file_type=kind, process=False, resolver=buffers, **options)
+        mesh = trimesh.load_mesh(file, kind, process=False, resolver=buffers, skip_materials=True)
     return Mesh(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64))

@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from sdfhub.data.sources.mesh_files import MAX_BYTES, triangles_of
-from sdfhub.data.sources.source import Shape, Source, checked_categories, folder_safe
+from sdfhub.data.sources.source import Shape, Source, folder_safe
+from sdfhub.described import check
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.shapes import Mesh
 from sdfhub.triangles import face_normals
@@ -67,7 +68,7 @@ class OpenSource(Source):
     name = "open"
 
     def __init__(self, categories: Mapping[str, Any], root: str = "data/open"):
-        self.rules, self.root = checked_categories(categories, Rules), Path(root)
+        self.rules, self.root = check(categories, dict[str, Rules], "category"), Path(root)
         self._places: dict[str, tuple[Path, str]] = {}
 
     def shapes(self) -> list[Shape]:
@@ -107,7 +108,6 @@ class OpenSource(Source):
     def _candidates(self) -> Iterator[tuple[str, Choice, Path, str, dict[str, str]]]:
         """Category, its choice, file, member of the archive (empty: none) and credits."""
         for category, rules in sorted(self.rules.items()):
-            choice: Choice | None
             if choice := rules.catalogue:
                 for archive in sorted(self.root.rglob("*.sh3f")):
                     for member, credits in furniture_in(archive):

@@ -1,6 +1,7 @@
 """Shapes from the embedded parametric generators: no download, closed meshes, any number of them."""
 
 from collections.abc import Iterable
+from itertools import product
 from typing import Annotated
 
 from pydantic import Field
@@ -29,11 +30,8 @@ class ProceduralSource(Source):
             raise SdfhubError(f"category={unknown[0]}: data=procedural generates only {known}")
 
     def shapes(self) -> list[Shape]:
-        return [
-            Shape(f"{category}/{index:04d}", category, f"{procedural.VERSION}/{category}/{index}")
-            for category in self.categories
-            for index in range(self.count)
-        ]
+        pairs = product(self.categories, range(self.count))
+        return [Shape(f"{name}/{i:04d}", name, f"{procedural.VERSION}/{name}/{i}") for name, i in pairs]
 
     def load(self, shape: Shape) -> Mesh:
         return procedural.generate(shape.category, int(shape.id.rpartition("/")[2]))

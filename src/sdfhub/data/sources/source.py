@@ -11,9 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, TypeVar
-
-from pydantic import TypeAdapter, ValidationError
+from typing import Literal
 
 from sdfhub.errors import SdfhubError
 from sdfhub.shapes import Mesh, ShapeSamples, check_id
@@ -21,7 +19,6 @@ from sdfhub.shapes import Mesh, ShapeSamples, check_id
 log = logging.getLogger(__name__)
 
 Role = Literal["train", "held_out"]
-Settings = TypeVar("Settings")
 
 
 @dataclass(frozen=True)
@@ -46,11 +43,6 @@ class Source(ABC):
     has_normals = True  # whether its shapes come with surface normals
     is_collection = False  # whether it has what it has: numbers of shapes asked for are upper bounds
 
-    @property
-    def label(self) -> str:
-        """What runs and tables may call its shapes."""
-        return self.name
-
     @abstractmethod
     def shapes(self) -> list[Shape]:
         """All shapes on offer, sorted by id, the same in every process; SdfhubError where there is none."""
@@ -58,16 +50,6 @@ class Source(ABC):
     @abstractmethod
     def load(self, shape: Shape) -> Mesh | ShapeSamples:
         """The mesh of one shape in its source's frame, or its samples; RejectedMesh where there is none."""
-
-
-def checked_categories(categories: Any, settings: type[Settings]) -> dict[str, Settings]:
-    """The settings of each category, checked; raises SdfhubError with the key of what is wrong."""
-    try:
-        return TypeAdapter(dict[str, settings]).validate_python(categories)  # type: ignore[valid-type]
-    except ValidationError as error:
-        problem = error.errors()[0]
-        key = ".".join(map(str, ("category", *problem["loc"])))
-        raise SdfhubError(f"{key}={problem['input']}: {problem['msg']}") from error
 
 
 def folder_safe(text: str) -> str:

@@ -33,7 +33,7 @@ from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.described import describe
 from sdfhub.errors import RejectedMesh, SdfhubError
 from sdfhub.locks import locked
-from sdfhub.shapes import SHAPE_ID, ShapeSamples, check_id
+from sdfhub.shapes import SHAPE_ID, ShapeSamples
 from sdfhub.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -68,10 +68,10 @@ class Store(dict[str, StoredShape]):
     def summary(self) -> str:
         """Kept, rejected by reason, seconds a shape: lines for a reader."""
         seconds = sum(shape.record.seconds for shape in self.values()) / max(1, len(self))
-        kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         such = {record.reason: f"{id} ({record.detail})" for id, record in self.rejected.items()}
         counts = Counter(record.reason for record in self.rejected.values()).most_common()
         rejected = "".join(f"\n  rejected {n} x {reason}, such as {such[reason]}" for reason, n in counts)
+        kept = f"{len(self)} shapes kept, {len(self.rejected)} rejected"
         return f"{kept}; preparing took {seconds:.2f} s a shape{rejected}"
 
 
@@ -113,7 +113,8 @@ def prepare_part(
         for index, result in bar:
             if isinstance(result, Crashed):
                 what = "the worker process died: out of memory, or a fault in a native library"
-                write_shape(_file(folder, left[index].id), {}, _record(left[index], what, reason="crash"))
+                record = _record(left[index], what, reason="crash")
+                write_shape(folder / f"{left[index].id}{SUFFIX}", {}, record)
     return len(left)
 
 
@@ -144,7 +145,7 @@ def prepare_shape(source: Source, preparation: Preparation, folder: Path, shape:
     except Exception as error:  # whatever a strange mesh provokes, the other shapes go on
         record = _record(shape, f"{type(error).__name__}: {error}", reason="error")
     seconds = round(time.perf_counter() - start, 4)
-    write_shape(_file(folder, shape.id), arrays, replace(record, seconds=seconds))
+    write_shape(folder / f"{shape.id}{SUFFIX}", arrays, replace(record, seconds=seconds))
 
 
 def _record(shape: Shape, detail: str = "", **known: Any) -> Record:
@@ -158,14 +159,9 @@ def _left(shapes: list[Shape], stored: dict[str, StoredShape]) -> list[Shape]:
     return [shape for shape in shapes if final.get(shape.id) != shape.fingerprint]
 
 
-def _file(folder: Path, id: str) -> Path:
-    check_id(id)
-    return folder / f"{id}{SUFFIX}"
-
-
 def _read(folder: Path, ids: Iterable[str], up: Literal["y", "z"], level: int) -> dict[str, StoredShape]:
     """The stored shapes of some ids, in their order, without those that are missing or clearly damaged."""
-    paths = {id: _file(folder, id) for id in ids}
+    paths = {id: folder / f"{id}{SUFFIX}" for id in ids}
     for parent in {path.parent for path in paths.values()}:
         if not parent.resolve().is_relative_to(folder.resolve()):
             raise SdfhubError(f"{parent}: leads out of the store; remove that link")

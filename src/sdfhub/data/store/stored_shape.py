@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import field
 from io import BufferedReader
 from pathlib import Path
@@ -156,13 +156,11 @@ class StoredShape:
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
-        try:
-            with self._opened() as file:
-                file.seek(self._start)
-                digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
+        with suppress(SdfhubError), self._opened() as file:
+            file.seek(self._start)
+            digest = hashlib.file_digest(file, lambda: _digest(self.record, self._header))
             return digest.hexdigest() == self.record.sha256
-        except SdfhubError:
-            return False
+        return False
 
     @contextmanager
     def _opened(self) -> Iterator[BufferedReader]:
@@ -173,14 +171,15 @@ class StoredShape:
                 yield file
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error  # without "[Errno 2]" and the path once more
-            again = "start or prepare again: damaged shapes are prepared anew"
-            raise SdfhubError(f"{self.path}: {why}; {again}") from error
+            raise SdfhubError(f"{self.path}: {why}; start or prepare again: it is made anew") from error
 
 
 def signed_samples(
-    shape: StoredShape, count: int, rng: np.random.Generator, rows: np.ndarray | None = None
+    shape: StoredShape, count: int | None, rng: np.random.Generator, rows: np.ndarray | None = None
 ) -> np.ndarray:
-    """[count, 4] samples, half outside, half inside (the odd one outside), in contiguous `rows` if given."""
+    """[count, 4] samples (None: all), half of them inside, rounded down; in contiguous `rows` if given."""
+    if count is None:
+        return np.concatenate([shape.read("outside"), shape.read("inside")])
     rows = np.empty((count, 4), np.float32) if rows is None else rows
     draw_rows(rows[: count - count // 2], shape, "outside", rng)
     draw_rows(rows[count - count // 2 :], shape, "inside", rng)
