@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from sdfhub.data.store.store import shape_seed
-from sdfhub.data.store.stored_shape import StoredShape, draw_rows
+from sdfhub.data.store.stored_shape import StoredShape
 from sdfhub.data.workers import Crashed, map_in_processes
 from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.scoresheet import Judged, write_scores
@@ -63,8 +63,8 @@ def evaluate_model(
 ) -> dict[str, Any]:
     """Judges training shapes, by rows of the codes [S, L], and held-out ones; writes and gives the scores.
 
-    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Codes of held-out shapes
-    are fitted under the clamp `delta`. `training` is plain data for `metrics.json`.
+    Shapes without a mesh (DeepSDF's npz files) are judged by signed distances alone. Fits are clamped by
+    `delta`; `training` is for `metrics.json`.
     """
     decoder.eval()
     known = list(train.items())[: evaluation.train]
@@ -115,9 +115,8 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
-    judge_one = lambda pair: judge(pair[0], pair[1], evaluation.points, evaluation.seed)  # noqa: E731
-    judged = dict(map_in_processes(judge_one, pairs(), workers))
-    metrics = [judged[index] for index in range(len(roles))]
+    judge_one = lambda pair: judge(*pair, evaluation.points, evaluation.seed)  # noqa: E731
+    metrics = [row for _, row in sorted(map_in_processes(judge_one, pairs(), workers))]
     if any(isinstance(row, Crashed) for row in metrics):
         raise SdfhubError("a process that judges died twice: out of memory? try evaluate.workers=0")
     columns = zip(roles, metrics, pictures, strict=True)
@@ -128,10 +127,8 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
 def distance_metrics(decoder: Decoder, code: Tensor, shape: StoredShape, delta: float) -> DistanceMetrics:
     """How far the field is from a shape's own samples, up to 100,000 a side."""
     rng = np.random.default_rng(0)
-    sides = []
-    for name in ("outside", "inside"):
-        sides.append(np.empty((min(shape.rows(name), 100_000), 4), np.float32))
-        draw_rows(sides[-1], shape, name, rng)
+    counts = {name: shape.rows(name) for name in ("outside", "inside")}
+    sides = [shape.read(name, int(rng.integers(n or 1)), min(n, 100_000)) for name, n in counts.items()]
     rows = torch.from_numpy(np.concatenate(sides)).to(code.device)
     field = distances(decoder, rows[None, :, :3], code[None])[0]
     error = (field - rows[:, 3]).abs()[rows[:, 3].abs() < delta].mean()

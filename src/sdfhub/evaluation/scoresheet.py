@@ -3,10 +3,10 @@
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ COLUMNS = {  # of the printed table: headings and factors; files carry all metri
 TITLES = {"train": "training shapes", "held_out": "held-out shapes"}
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """One judged shape; `pictures` of those on the contact sheet."""
 
     role: str  # `train` or `held_out`
@@ -43,10 +42,7 @@ class Judged:
 def write_scores(
     judged: Sequence[Judged], evaluation: Any, training: dict[str, Any] | None, out: Path
 ) -> dict[str, Any]:
-    """Writes `metrics.json`, `metrics.csv` and `contact_sheet.png` below `out`; prints the table.
-
-    Returns what `metrics.json` holds: settings, numbers about the training, a role's `summary` and `shapes`.
-    """
+    """Writes `metrics.csv`, `contact_sheet.png` and, which is returned, `metrics.json`; prints the table."""
     import pandas  # here: slow to import, and every training would wait for it before its first step
 
     result: dict[str, Any] = {"evaluation": asdict(evaluation), "training": training}

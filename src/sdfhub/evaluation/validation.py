@@ -1,6 +1,6 @@
 """The quick judgement of a few shapes during a training, for monitors and curves."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveI
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from sdfhub.data.loading.datamodule import ValidationShape
 from sdfhub.data.store.stored_shape import signed_samples
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.metrics import chamfer
@@ -18,16 +19,12 @@ from sdfhub.model.fast.computing import distances
 from sdfhub.shapes import NormalizedMesh, Observation
 from sdfhub.space import reconstruct
 
-if TYPE_CHECKING:
-    from sdfhub.data.loading.datamodule import ValidationShape  # Lightning's, which spaces do without
-
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
 class Validation:
     """Scores a training shape with its own code, or a held-out one with a code fitted to its samples.
 
-    Coarse and cheap: for states of one training, not for tables. It draws the same samples every time, and
-    changes neither weights nor random states.
+    Coarse and cheap, not for tables. The same samples every time; neither weights nor random states change.
     """
 
     fit: SkipValidation[Fit]  # finds the codes of held-out shapes
@@ -36,7 +33,7 @@ class Validation:
     delta: PositiveFloat = 0.1  # clamp of distances in the training, normalised frame
     seed: NonNegativeInt = 0  # of all samples
 
-    def __call__(self, decoder: Decoder, item: "ValidationShape", codes: Tensor) -> dict[str, float]:
+    def __call__(self, decoder: Decoder, item: ValidationShape, codes: Tensor) -> dict[str, float]:
         """The scores of one shape, from a decoder in evaluation mode and codes [S, L].
 
         `sdf_error`: mean |f - d| over samples with |d| < delta. `cd`: Chamfer distance times 10^3, where the
@@ -44,12 +41,9 @@ class Validation:
         """
         rows = signed_samples(item.shape, self.fit.samples or self.points, np.random.default_rng(self.seed))
         with torch.inference_mode(False), torch.no_grad():  # fits need derivatives
-            codes = codes.detach()
-            if item.row is None:
-                observation = Observation.of_samples(rows[:, :3], rows[:, 3])
-                code = self.fit(decoder, codes, [observation], self.delta).codes[0]
-            else:
-                code = codes[item.row]
+            seen, codes = Observation.of_samples(rows[:, :3], rows[:, 3]), codes.detach()
+            row = item.row
+            code = codes[row] if row is not None else self.fit(decoder, codes, [seen], self.delta).codes[0]
             near = torch.from_numpy(rows[np.abs(rows[:, 3]) < self.delta]).to(code.device)
             field = distances(decoder, near[None, :, :3], code[None])[0]
             scores = {"sdf_error": float((field - near[:, 3]).abs().mean())}

@@ -13,8 +13,7 @@ NOISE = 1e-6  # excess that 30,000 points a side cannot tell from none, normalis
 def objective(metrics: dict[str, Any]) -> float:
     """What a search lowers: the geometric mean of mean and median excess CD of both roles, in `metrics.json`.
 
-    A median alone would not see one broken shape of eight. Sources without meshes are judged by the error of
-    distances. Infinite after a failure.
+    A median alone would not see one broken shape. Without meshes: error of distances. Failure: infinite.
     """
     judged = [metrics[role]["shapes"] for role in ROLES if metrics.get(role, {}).get("shapes")]
     errors = [

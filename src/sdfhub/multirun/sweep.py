@@ -1,7 +1,4 @@
-"""A multirun from its plan to its report, and each of its cells.
-
-A cell is trained once and continued where it was interrupted; its failure is written down.
-"""
+"""A multirun from its plan to its report; each cell trained once, continued, its failure written down."""
 
 import json
 import logging
@@ -30,9 +27,7 @@ from sdfhub.report.results import FAILURE, PlannedCell, enter_cells, read_plan, 
 from sdfhub.settings import WHERE_NOT_WHAT, settings_digest
 from sdfhub.whole_file import write_whole
 
-Train = Callable[[DictConfig, Path], dict[str, Any]]
-"""Trains what a composed config describes into a folder; returns what `metrics.json` holds."""
-
+Train = Callable[[DictConfig, Path], dict[str, Any]]  # of a config into a folder: what `metrics.json` holds
 WATCHING_GROUPS = ("callbacks", "logger", "debug", "paths", "extras")
 UNNAMED = {"conditioning", "decoder", "loss", "optim"}  # groups that name no row: they count as settings
 
@@ -42,8 +37,7 @@ log = logging.getLogger(__name__)
 class SweepRecord(Callback):
     """`sweep.json` before the first cell, the report after the last; status 1 where a cell failed."""
 
-    def __init__(self) -> None:
-        self._cells: list[PlannedCell] = []
+    _cells: list[PlannedCell] = []  # noqa: RUF012 - replaced, never changed
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ = state
@@ -52,7 +46,7 @@ class SweepRecord(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         if config.hydra.job.config_name != "config":  # preparation makes no cells
             return
-        words = _words(config)
+        words = _words(config.hydra)
         asked = [word for word in words if word.startswith(("sweeps=", "hparams_search="))]
         try:
             if len(asked) > 1 or "," in "".join(asked):  # Hydra would train the cells of none of them
@@ -63,7 +57,7 @@ class SweepRecord(Callback):
         except ValueError as error:
             print(f"sdfhub: error: {one_line(error)}", file=sys.stderr)
             sys.exit(2)  # what a callback raises, Hydra makes a warning of
-        words += [word for word in _words(config, "hydra") if not word.startswith("hydra.mode=")]
+        words += [word for word in _words(config.hydra, "hydra") if not word.startswith("hydra.mode=")]
         command = shlex.join(["python", "train.py", "-m", *words])
         enter_cells(Path(config.hydra.sweep.dir), self._cells, command)
 
@@ -89,16 +83,16 @@ def planned_cells(config: DictConfig) -> list[PlannedCell]:
         return []
     loader = GlobalHydra.instance().config_loader()
     params: Any = OmegaConf.to_container(config.hydra.sweeper.params or OmegaConf.create({}))
-    words = [f"{key}={value}" for key, value in params.items()] + _words(config)
+    words = [f"{key}={value}" for key, value in params.items()] + _words(config.hydra)
     overrides = OverridesParser.create(config_loader=loader).parse_overrides(words)
     (jobs,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
     cells = [loader.load_sweep_config(config, job) for job in jobs]
     return [planned_cell(cell, cell.hydra, str(cell.hydra.sweep.subdir)) for cell in cells]
 
 
-def _words(config: DictConfig, part: str = "task") -> list[str]:
-    """The overrides of the command line as they were typed."""
-    return list(map(str, OmegaConf.to_container(config.hydra.overrides[part], resolve=False) or ()))
+def _words(hydra: DictConfig, part: str = "task") -> list[str]:
+    """The overrides of the command line as they were typed, `${oc.env:...}` too."""
+    return list(map(str, OmegaConf.to_container(hydra.overrides[part], resolve=False) or ()))
 
 
 def run_cell(train: Train, config: DictConfig, hydra: DictConfig) -> dict[str, Any]:
@@ -147,8 +141,7 @@ def finished(folder: Path, config: dict[str, Any]) -> dict[str, Any] | None:
 def planned_cell(config: DictConfig, hydra: DictConfig, folder: str) -> PlannedCell:
     """A composed cell as `sweep.json` keeps it; a ValueError for a seed that is no whole number."""
     choices = choices_of(config, hydra)
-    words: Any = OmegaConf.to_container(hydra.overrides.task, resolve=False)  # ${oc.env:...} as written
-    pairs = [word.lstrip("+~").partition("=") for word in words]
+    pairs = [word.lstrip("+~").partition("=") for word in _words(hydra)]
     other = ("seed", *WHERE_NOT_WHAT)
     settings = {k: v for k, _, v in pairs if not k.startswith(other) and k not in choices.keys() - UNNAMED}
     choices = {group: choice for group, choice in choices.items() if group not in WATCHING_GROUPS}

@@ -1,1 +1,0 @@
-"""From the folders of a sweep to tables, claims and one page. Plain data in, plain files out."""

@@ -4,28 +4,27 @@ import base64
 import io
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, NamedTuple
 
 import fast_simplification
 import matplotlib
 import numpy as np
-import trimesh
 from matplotlib.figure import Figure
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sdfhub.data.sources.mesh_files import read_mesh
 from sdfhub.data.store.stored_shape import StoredShape
+from sdfhub.errors import SdfhubError
 from sdfhub.geometry.render import render
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell, ShapeScore
 from sdfhub.report.rows import Group, Row
 from sdfhub.shapes import Frame, UpAxis, turned_up
 
-PIXELS, PAPER = 208, 0.955
-"""Side of a picture, and the grey level behind the shape: a tile on a light page and on a dark one."""
-
+PIXELS, PAPER = 208, 0.955  # side of a picture, and its grey level: a tile on a light page and on a dark one
 TRIANGLES = 1500  # of a mesh to turn, some 12 bytes each
-FindTruth = Callable[[Cell, str], StoredShape | None]
-"""The prepared shape of an id that a cell was trained or judged on; None where it is not on this machine."""
+FindTruth = Callable[[Cell, str], StoredShape | None]  # a cell's shape by id, where it is on this machine
 
 
 class ShownMesh(NamedTuple):
@@ -60,8 +59,8 @@ class Sheet(NamedTuple):
         """The meshes to turn: a dict a shape with its `name`, its `role` and its meshes, labelled."""
         shapes = []
         for column, (role, id) in enumerate(self.shapes):
-            meshes = [(label, tiles[column].turning) for label, tiles in self.rows]
-            panels = [{"label": label} | mesh for label, mesh in meshes if mesh]
+            labelled = [(label, tiles[column].turning) for label, tiles in self.rows]
+            panels = [{"label": label} | mesh for label, mesh in labelled if mesh]
             shapes += [{"name": id, "role": role.replace("_", " "), "panels": panels}] if panels else []
         return shapes
 
@@ -99,13 +98,9 @@ def reconstruction(cell: Path, role: str, score: ShapeScore, truth: StoredShape 
     if score.failed or not path.resolve().is_relative_to(cell.resolve() / "meshes" / role):
         return None
     try:
-        with path.open("rb") as file:
-            mesh = trimesh.load_mesh(file, file_type="ply", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        if not (np.isfinite(vertices).all() and 0 <= faces.min() <= faces.max() < len(vertices)):
-            return None
+        vertices, faces = read_mesh(path)
         frame = truth.frame if truth else Frame.around(vertices)[0]
-    except Exception:  # no such file, no face, or one of the ways in which trimesh meets a broken file
+    except (SdfhubError, OSError, ValueError):  # no such file, a broken one, or a mesh that is a point
         return None
     return ShownMesh(frame.to_normalized(vertices), faces, truth.up if truth else "z")
 
@@ -151,9 +146,7 @@ def loss_chart(group: Group) -> str | None:
     figure = Figure((7.6, 4.2), layout="constrained")
     axes = figure.subplots()
     for index, row in enumerate(group.rows):
-        label = (row.label if len(row.label) < 60 else f"{row.label[:58]}…").replace(
-            "$", r"\$"
-        )  # no formulas
+        label = shorten(row.label, 60, placeholder=" …").replace("$", r"\$")  # no formulas
         for curve in filter(None, (loss_curve(cell.folder) for cell in row.done)):
             line = "-" if row.normals == "on" else "--"
             axes.plot(*zip(*curve, strict=True), color=f"C{index % 10}", ls=line, lw=1.3, label=label)

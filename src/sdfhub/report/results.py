@@ -1,18 +1,16 @@
 """A sweep's folder as plain data: the cells that `sweep.json` lists, and what each has left behind, checked.
 
-A cell is one training. Its folder is named after all its settings: cells of another scale, category or seed
-lie side by side, and a cell whose settings have changed since is superseded, not overwritten. Nothing in a
-cell's files is run, and no link is followed out of its folder.
+A cell is one training. Nothing in its files is run, and no link is followed out of its folder.
 """
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
-from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, Json, StringConstraints, TypeAdapter, ValidationError
 
 from sdfhub.errors import SdfhubError
 from sdfhub.settings import flat
@@ -26,7 +24,6 @@ Text = Annotated[str, StringConstraints(max_length=2000)]
 FolderName = Annotated[str, StringConstraints(pattern=r"^[^./\\][^/\\]*$", max_length=255)]
 Number = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
-Name = Annotated[str, StringConstraints(max_length=300)]
 
 
 class PlannedCell(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -53,18 +50,15 @@ class Plan(BaseModel, extra="forbid"):
 
 def read_plan(sweep: Path) -> Plan:
     """What a sweep's folder consists of; refuses one that is none, or whose `sweep.json` is broken."""
+    return read_json(Plan, sweep / PLAN, "the folder of a multirun")
+
+
+def read_json(kind: type[BaseModel], path: Path, owner: str) -> Any:
+    """What a JSON file says, checked; a folder that has no such file is refused as not `owner`."""
     try:
-        return Plan.model_validate_json((sweep / PLAN).read_bytes())
+        return _checked(Json[kind], path.read_bytes(), str(path))  # type: ignore[misc, valid-type]
     except OSError as error:
-        raise SdfhubError(f"{sweep}: not the folder of a multirun: it has no {PLAN}") from error
-    except ValidationError as error:
-        raise SdfhubError(f"{sweep / PLAN}: {first_fault(error)}") from error
-
-
-def first_fault(error: ValidationError) -> str:
-    """Where the first fault of checked data lies, and what it is."""
-    fault = error.errors()[0]
-    return f"{'.'.join(map(str, fault['loc']))}: {fault['msg'].lower()}"
+        raise SdfhubError(f"{path.parent}: not {owner}: it has no {path.name}") from error
 
 
 def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None = None) -> None:
@@ -84,7 +78,7 @@ def enter_cells(sweep: Path, cells: Iterable[PlannedCell], command: str | None =
 class ShapeScore(BaseModel, frozen=True):
     """One judged shape."""
 
-    id: Name
+    id: Text
     cd: Number | None
     floor: Number
     cd_penalty: Number  # the Chamfer distance of a single point
@@ -105,7 +99,7 @@ class ShapeScore(BaseModel, frozen=True):
 class DistanceScore(BaseModel, frozen=True):
     """One shape of a source without meshes: mean |f - d| near its surface, share of signs that are right."""
 
-    id: Name
+    id: Text
     sdf_error: Number
     sign_accuracy: Number
 
@@ -116,11 +110,10 @@ class Training(BaseModel, frozen=True):
     seconds: Number
     steps: Count
     parameters: Count
-    made_with: dict[Name, Name] = {}
+    made_with: dict[Text, Text] = {}
 
 
-@dataclass(frozen=True)
-class Scores:
+class Scores(NamedTuple):
     """The scores of a finished cell."""
 
     shapes: dict[str, list[ShapeScore] | list[DistanceScore]]  # by role
@@ -132,18 +125,15 @@ class Scores:
         """Cost by name: `epochs` that were asked for, signed `samples` drawn in all, ..."""
         costs = self.training.model_dump(exclude={"made_with"}) | {"trained_on": self.trained_on}
         settings = flat(self.config)
-        try:
+        with suppress(KeyError, TypeError, ValueError, OverflowError):  # a loader of the user's own
             costs["epochs"] = int(settings["trainer.max_epochs"])
             rows = self.trained_on * (1 + int(settings.get("data.loader.augmentation.copies") or 0))
             shapes = min(rows, int(settings["data.loader.shapes_per_step"]))
             costs["samples"] = shapes * int(settings["data.loader.samples_per_shape"]) * self.training.steps
-        except (KeyError, TypeError, ValueError, OverflowError):
-            pass  # a loader of the user's own
         return costs
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A cell of a sweep as it stands; `failed` also where its files are broken."""
 
     plan: PlannedCell
@@ -180,7 +170,7 @@ def read_scores(folder: Path) -> Scores:
         kind: Any = DistanceScore if "sdf_error" in str(rows)[:1000] else ShapeScore
         shapes[role] = _checked(list[kind], rows, f"metrics.json: {role}.shapes")
     training = _checked(Training, metrics.get("training"), "metrics.json: training")
-    trained_on = _checked(list[Name], _read(folder, "split.json").get("train"), "split.json: train")
+    trained_on = _checked(list[Text], _read(folder, "split.json").get("train"), "split.json: train")
     return Scores(shapes, training, len(trained_on), _read(folder, "config.yaml"))
 
 
@@ -199,4 +189,5 @@ def _checked(kind: Any, content: Any, name: str) -> Any:
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
-        raise SdfhubError(f"{name}.{first_fault(error)}") from error
+        fault = error.errors()[0]
+        raise SdfhubError(f"{'.'.join(map(str, (name, *fault['loc'])))}: {fault['msg'].lower()}") from error

@@ -11,14 +11,11 @@ from scipy import stats
 from sdfhub.report.results import ROLES, TABLE_UNIT, Cell
 from sdfhub.settings import OF_THE_SEED, deciding
 
+# encodings, as the paper writes them or would
 PREFIXES = {"none": "", "fourier": "FFT/", "gaussian": "GAUSS/", "hash": "HASH/"}
-"""The paper's names of encodings, and ours for those that it does not name."""
-
+# groups and settings that decide which shapes are judged, and how: rows that differ in one are not compared
 JUDGING_GROUPS = ("sweeps", "data", "category", "scale", "fit", "evaluate")
-"""Config groups under which numbers may be compared: rows that differ in one stand in different tables."""
-
-JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")
-"""Settings of the command line that decide which shapes are judged, and how; `data.loader.` does not."""
+JUDGING_SETTINGS = ("data.", "evaluate.", "scale.small_table")  # but for `data.loader.`
 
 MEASURES = ["cd", "floor", "excess", "normal_consistency", "no_surface", "sdf_error", "sign_accuracy"]
 NAMES = ["method", "normals", "detail", "label"]
@@ -61,8 +58,8 @@ class Group:
         done = [cell for row in self.rows for cell in row.done]
         self.first = done[0] if done else None
         self.settings = [f"{key}={value}" for key, value in self.judging.items() if key not in JUDGING_GROUPS]
-        self.place = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}  # columns of a CSV file
-        self.place["settings"] = ";".join(self.settings)
+        groups = {name: self.judging.get(name, "") for name in JUDGING_GROUPS}
+        self.place = groups | {"settings": ";".join(self.settings)}  # columns of a CSV file
         counts = sorted({cell.scores.trained_on for cell in done})
         ends = " to ".join(map(str, dict.fromkeys(counts[:1] + counts[-1:]))) or "nothing yet"
         parts = [f"{k}={v}" for k, v in self.judging.items() if k not in ("sweeps", "category")]

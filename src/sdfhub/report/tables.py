@@ -14,21 +14,19 @@ from sdfhub.report.rows import NONE, Group, differing, settings_of
 
 TITLES = {"train": "Training shapes", "held_out": "Held-out shapes"}
 
+# columns of `Group.statistics` by their headings: of shapes with meshes, and of those without
 SURFACES = {"CD mean": "cd_mean", "CD median": "cd_median", "floor": "floor_mean"}
 SURFACES |= {"excess mean": "excess_mean", "excess median": "excess_median"}
 SURFACES |= {"normals": "normal_consistency_mean", "no surface": "no_surface"}
 DISTANCES = {"|f - d| mean": "sdf_error_mean", "|f - d| median": "sdf_error_median"}
 DISTANCES |= {"signs right": "sign_accuracy_mean"}
-"""Columns of `Group.statistics` by their headings: of shapes with meshes, and of those without."""
 
 ABOUT_CD = (
     "CD, floor and excess times 10³, normalised frame; excess is CD above the noise floor of two samplings "
     "of the truth. A shape without a surface counts with the CD of a single point. Normals: mean |cos| "
     "between those of reconstruction and truth. ± is a 95% confidence interval over seeds (Student's t)."
 )
-ABOUT_DISTANCES = (
-    "No meshes, no CD. |f - d| times 10³, over samples near a shape's surface, then over shapes."
-)
+ABOUT_DISTANCES = "No meshes, no CD. |f - d| times 10³, over samples near a surface, then over shapes."
 ABOUT_OVERVIEW = "Excess CD times 10³, mean and median over shapes; in brackets the number of seeds."
 ABOUT_COSTS = "Samples are signed distances drawn in all. Times compare on one idle machine."
 ABOUT_SETTINGS = "Read from config.yaml of each row's first finished cell; the seed and paths left out."
@@ -51,13 +49,12 @@ def tables(group: Group) -> list[Table]:
     scores = [_scores(group, role, *kind) for role in ROLES for kind in kinds]
     first = {row.label: settings_of(row.first) for row in group.rows if row.first}
     lines = sorted((key, *values) for key, values in differing(list(first.values())).items())
-    settings = pd.DataFrame(lines, columns=["setting", *first])
+    frame = pd.DataFrame(lines, columns=["setting", *first])
+    settings = Table("Settings that differ", frame, ABOUT_SETTINGS, prose=True)
     cells = [(row, cell) for row in group.rows for cell in row.cells if cell.state != "done"]
     reasons = [[f"{row.label}, seed {cell.plan.seed}", cell.state, cell.reason] for row, cell in cells]
-    absent = pd.DataFrame(reasons, columns=["cell", "state", "reason"])
-    prose = [Table("Settings that differ", settings, ABOUT_SETTINGS, prose=True), _costs(group)]
-    prose += [Table("Not there", absent, prose=True)]
-    return [table for table in (*scores, *prose) if table and len(table.frame)]
+    absent = Table("Not there", pd.DataFrame(reasons, columns=["cell", "state", "reason"]), prose=True)
+    return [table for table in (*scores, settings, _costs(group), absent) if table and len(table.frame)]
 
 
 def overview(groups: list[Group]) -> list[Table]:
@@ -74,9 +71,8 @@ def overview(groups: list[Group]) -> list[Table]:
             lines = _lines(group, role).reindex(labels)
             means, medians = (_texts(lines, f"excess_{name}", False) for name in ("mean", "median"))
             seeds = [f" ({n:.0f})" if n > 1 else "" for n in lines["excess_mean_seeds"]]
-            texts = [
-                NONE if a == NONE else f"{a}, {b}{n}" for a, b, n in zip(means, medians, seeds, strict=True)
-            ]
+            parts = zip(means, medians, seeds, strict=True)
+            texts = [NONE if mean == NONE else f"{mean}, {median}{count}" for mean, median, count in parts]
             frame.insert(len(frame.columns), column, texts, allow_duplicates=True)
         if (frame.iloc[:, 1:] != NONE).any(axis=None):
             overviews.append(Table(f"{TITLES[role]}, excess", frame, ABOUT_OVERVIEW))
@@ -96,8 +92,8 @@ def origin(commands: list[str], cells: list[Cell]) -> Table:
 
 def _lines(group: Group, role: str) -> pd.DataFrame:
     """The statistics of a role, a line for each row; not a number where a row has none."""
-    lines = group.statistics[group.statistics.index.get_level_values("role") == role].droplevel("role")
-    return lines.reindex([row.label for row in group.rows])
+    rows = pd.MultiIndex.from_product([[row.label for row in group.rows], [role]])
+    return group.statistics.reindex(rows).droplevel(1)
 
 
 def _scores(group: Group, role: str, title: str, quantities: dict[str, str], about: str) -> Table | None:

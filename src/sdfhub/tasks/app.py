@@ -4,11 +4,10 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -16,14 +15,12 @@ from sdfhub.composition import configuration_folder, drop_replaced, one_line
 from sdfhub.errors import SdfhubError
 from sdfhub.multirun.names import register_resolvers
 
-Task = Callable[[DictConfig], float | None]  # of a composed config; a search lowers what is returned
-
+# Hydra's options whose value is the next word
 TAKES_A_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p")
-"""Hydra's options whose value is the next word."""
 
 
-def run_task(task: Task, config_name: str, positional: Sequence[str] = ()) -> None:
-    """Composes `config_name` with the words of the command line and runs `task` on it.
+def run_task(task: Callable[[DictConfig], float | None], config_name: str, positional: Sequence[str]) -> None:
+    """Composes `config_name` with the command line's words and runs `task`, whose result a search lowers.
 
     Exit status: 0, 2 after a user's mistake (one line on stderr, no traceback), 130 after Ctrl-C; 1 where
     Hydra refuses the command line. HYDRA_FULL_ERROR=1 in the environment shows tracebacks.
@@ -71,8 +68,7 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
     """
     given = {word.partition("=")[0] for word in argv if not is_positional(word)}
     left = [name for name in names if name.removesuffix("...") not in given]
-    overrides: list[str] = []
-    many: list[str] = []
+    overrides, many = list[str](), list[str]()
     for before, word in zip(["", *argv], argv, strict=False):
         if before in TAKES_A_VALUE or not is_positional(word) or not left:
             overrides.append(word)
@@ -85,19 +81,12 @@ def words_to_overrides(argv: Sequence[str], names: Sequence[str]) -> list[str]:
 
 def is_positional(word: str) -> bool:
     """Whether a word is a value without its name: an existing path, or neither assignment nor option."""
-    with suppress(OSError, ValueError):  # longer than a name may be, or with a NUL
-        if word and Path(word).exists():
-            return True
-    return "=" not in word and not word.startswith(("-", "~"))
+    return os.path.exists(word) or ("=" not in word and not word.startswith(("-", "~")))
 
 
 def quoted(word: str) -> str:
-    """A word as a string of Hydra's grammar, whatever is in it; a number that is no path stays one.
-
-    In quotes a backslash counts only before a quote, and `${` begins an interpolation, which `\\${` does not.
-    """
-    if re.fullmatch(r"\d+", word) and not Path(word).exists():
+    """A word as a string of Hydra's grammar, whatever is in it; a number that is no path stays one."""
+    if re.fullmatch(r"\d+", word) and not os.path.exists(word):
         return word
-    word = re.sub(r"(\\*)\$\{", r"\1\1\\${", word)
-    word = re.sub(r"(\\*)'", r"\1\1\\'", word)
-    return "'" + re.sub(r"(\\+)$", r"\1\1", word) + "'"
+    word = re.sub(r"(\\*)\$\{", r"\1\1\\${", word)  # `${` begins an interpolation, `\${` does not
+    return QuotedString(word, Quote.single).with_quotes()

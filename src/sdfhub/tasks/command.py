@@ -7,6 +7,8 @@ import sys
 
 import sdfhub
 
+# the keys that a task's words without `=` stand for, and what it does: the function of its name, in the
+# module of its name or in `gallery`, with the YAML of its name in conf/ (`train`: config.yaml)
 TASKS = {
     "train": ("", "learns a shape space: sdfhub train activation=hosc encoding=fourier"),
     "prepare": ("", "makes samples ahead of time: sdfhub prepare data=open category=chairs"),
@@ -20,11 +22,6 @@ TASKS = {
     "reconstruct": ("run scans...", "finds the shapes behind scans: sdfhub reconstruct RUN scan.ply"),
     "report": ("sweep", "tables and a page of a sweep: sdfhub report outputs/sweeps/table_small"),
 }
-"""The keys that a task's words without `=` stand for, and what it does.
-
-The task is the function of its name, in the module of its name or in `gallery`. Its YAML in conf/ has its
-name too; that of `train` is `config.yaml`.
-"""
 
 
 def main() -> None:

@@ -1,6 +1,5 @@
 """Task `evaluate`: a finished run is judged again."""
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ from sdfhub.errors import SdfhubError
 from sdfhub.evaluation.judging import evaluate_model
 from sdfhub.opening import beside, data_of, load, read_run
 from sdfhub.whole_file import refuse_unwritable
-
-log = logging.getLogger(__name__)
 
 
 def evaluate(config: DictConfig) -> None:
@@ -33,7 +30,6 @@ def evaluate(config: DictConfig) -> None:
     # under other settings (categories, count) a source of the same name offers shapes of the same ids
     seen = set(roles_then["train"]) if data.source.name == then.name else set()
     roles = choose_shapes(data.source, roles_then if is_same else {"train": [], "held_out": []}, seen, config)
-    log.info("shapes: %d of the training, %d held out", len(roles.train), len(roles.held_out))
     shapes, held_out = data.prepared(roles)
     train = {roles_then["train"].index(shape.id): shape for shape in shapes}
     refuse_unwritable(out)
@@ -57,16 +53,12 @@ def choose_shapes(source: Source, trained: dict[str, list[str]], seen: set[str],
     if ids is not None:
         train, unseen = [id for id in ids if id in train], [id for id in ids if id not in train]
         if trained_on := seen.intersection(unseen):
-            raise SdfhubError(
-                f"shapes: {min(trained_on)} was trained on; leave out data= to judge it as such"
-            )
+            raise SdfhubError(f"shapes: {min(trained_on)} was trained on; leave out data= to judge it so")
     elif count is not None:
         unseen = [shape.id for shape in split([offered[id] for id in unseen], 0, count, seed=0).held_out]
     elif train:
         unseen = trained["held_out"]
-    for id in (*train, *unseen):
-        if id not in offered:
-            raise SdfhubError(
-                f"shapes: {source.name} has no shape {id!r}; it has {', '.join(list(offered)[:3])} ..."
-            )
+    if unknown := {*train, *unseen} - offered.keys():
+        some = ", ".join(list(offered)[:3])
+        raise SdfhubError(f"shapes: {source.name} has no shape {min(unknown)!r}; it has {some} ...")
     return Split([offered[id] for id in train], [offered[id] for id in unseen])

@@ -19,8 +19,8 @@ from sdfhub.model.decoder import Decoder
 from sdfhub.opening import beside, load, write_space
 from sdfhub.whole_file import write_whole
 
+# what a space is exported as in one file, and its name by default
 FILES = {"safetensors": "model.safetensors", "onnx": "model.onnx", "torch_export": "model.pt2"}
-"""What a space is exported as in one file, and the file's name by default."""
 
 
 def export(config: DictConfig) -> None:
@@ -32,9 +32,7 @@ def export(config: DictConfig) -> None:
     path = folder / FILES[to] if to in FILES else Path(to)
     kind = {Path(file).suffix: kind for kind, file in FILES.items()}.get(path.suffix)
     if kind is None:
-        raise SdfhubError(
-            f"to={to}: choose {', '.join(FILES)}, meshes, or a .safetensors, .onnx or .pt2 file"
-        )
+        raise SdfhubError(f"to={to}: choose {', '.join(FILES)}, meshes, or a file by one of their suffixes")
     space = load(config.run, device="cpu", trust=config.trust or ())
     if kind != "safetensors":
         write_whole(path, function_file(as_function(space.decoder), kind))
@@ -82,12 +80,7 @@ def function_file(function: torch.export.ExportedProgram, kind: str) -> bytes:
         except ImportError as error:
             raise SdfhubError("to=onnx: needs more packages: pip install 'sdfhub[onnx]'") from error
         options: Any = {"input_names": ["points", "codes"], "output_names": ["sdf"]}
-        program = torch.onnx.export(function, dynamo=True, verbose=False, **options)
+        axes = {"points": {0: "B", 1: "N"}, "codes": {0: "B"}}
+        program = torch.onnx.export(function, dynamo=True, verbose=False, dynamic_shapes=axes, **options)
         assert program
-        model = program.model_proto
-        values = [*model.graph.input, *model.graph.output, *model.graph.value_info]
-        axes = [axis for value in values for axis in value.type.tensor_type.shape.dim]
-        names = {axis.dim_param: name for axis, name in zip(axes[:2], "BN", strict=True)}  # of `points`
-        for axis in [axis for axis in axes if axis.dim_param in names]:
-            axis.dim_param = names[axis.dim_param]
-        return model.SerializeToString()
+        return program.model_proto.SerializeToString()

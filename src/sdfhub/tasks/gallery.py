@@ -24,8 +24,8 @@ def interpolate(config: DictConfig) -> None:
     codes = space.interpolate(config.a, config.b, config.steps)
     a, b = (space.ids[space.row(shape)] for shape in (config.a, config.b))
     captions = [a, *(f"{index / (len(codes) - 1):.2f}" for index in range(1, len(codes) - 1)), b]
-    folder = beside(config.run, config.out, "interpolate/" + f"{a}_to_{b}".replace("/", "-"))
-    write_gallery(space, codes, captions, folder, config.resolution, animated=True)
+    name = f"{a}_to_{b}".replace("/", "-")
+    write_gallery(config, space, codes, captions, f"interpolate/{name}", animated=True)
 
 
 def sample(config: DictConfig) -> None:
@@ -36,8 +36,7 @@ def sample(config: DictConfig) -> None:
     for index, (id, distance) in enumerate(nearest):
         print(f"{index:03d}  nearest training shape: {id} ({distance:.4f})")
     captions = [f"new\nnearest {id}" for id, _ in nearest]
-    folder = beside(config.run, config.out, f"sample/seed_{config.seed}")
-    write_gallery(space, codes, captions, folder, config.resolution)
+    write_gallery(config, space, codes, captions, f"sample/seed_{config.seed}")
 
 
 def neighbours(config: DictConfig) -> None:
@@ -56,15 +55,14 @@ def neighbours(config: DictConfig) -> None:
         print(f"{id:<40} {distance:.4f}")
     captions = [f"of {name}", *(f"{id}\n{distance:.3f}" for id, distance in nearest)]
     codes = space.code([shape, *(id for id, _ in nearest)])
-    folder = beside(config.run, config.out, f"neighbours/{name.replace('/', '-')}")
-    write_gallery(space, codes, captions, folder, config.resolution)
+    write_gallery(config, space, codes, captions, f"neighbours/{name.replace('/', '-')}")
 
 
 def write_gallery(
-    space: Space, codes: Tensor, captions: Sequence[str], out: Path, resolution: int, animated: bool = False
+    config: DictConfig, space: Space, codes: Tensor, captions: Sequence[str], name: str, animated=False
 ) -> None:
-    """Writes `strip.png`, `meshes.glb`, `meshes/NUMBER.ply` (normalised frame) and maybe `animation.gif`."""
-    results = reconstruct(space.decoder, codes, resolution)
+    """Writes pictures, meshes (normalised frame) and maybe an animation into `out` or `name` of the run."""
+    out, results = beside(config.run, config.out, name), reconstruct(space.decoder, codes, config.resolution)
     meshes = list(tqdm(results, "meshing", len(codes), leave=False, disable=None))
     pictures = [render(*mesh, up=space.up) for mesh in meshes]
     shown = [p if len(mesh.faces) else "no surface" for p, mesh in zip(pictures, meshes, strict=True)]

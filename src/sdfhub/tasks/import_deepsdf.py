@@ -16,18 +16,17 @@ from typing import Any, Literal
 
 import torch
 from omegaconf import DictConfig
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from sdfhub.checkpoint_file import LAST, write_checkpoint
 from sdfhub.composition import plain
 from sdfhub.data.sources.deepsdf import DeepSdfSource, by_synset, frame_of, shape_id
 from sdfhub.data.sources.source import names_listed
-from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.model.saved import PARTS, saved_decoder
 from sdfhub.opening import begin_run, load
-from sdfhub.report.results import first_fault
+from sdfhub.report.results import read_json
 
 log = logging.getLogger(__name__)
 
@@ -63,24 +62,17 @@ class Specs(BaseModel):
 def import_deepsdf(composed: DictConfig) -> None:
     """The task: a config as conf/import_deepsdf.yaml has it."""
     config = plain(composed)
-    folder, epoch = Path(check(config["folder"], str, "folder")), check(config["epoch"], str | int, "epoch")
-    out, split = (check(config[key], str | None, key) for key in ("out", "split"))
-    run = Path(out or Path(config["paths"]["output"]) / "deepsdf" / folder.resolve().name)
+    folder, epoch = Path(str(config["folder"])), config["epoch"]
+    run = Path(str(config["out"] or Path(config["paths"]["output"], "deepsdf", folder.resolve().name)))
     if (run / "config.yaml").exists():
         raise SdfhubError(f"{run}: is there already; remove it, or choose another folder with out=")
-    try:
-        specs = Specs.model_validate_json((folder / "specs.json").read_bytes())
-    except OSError as error:
-        raise SdfhubError(
-            f"{folder}: not an experiment of DeepSDF's: specs.json: {error.strerror}"
-        ) from error
-    except ValidationError as error:
-        raise SdfhubError(f"{folder / 'specs.json'}: {first_fault(error)}") from error
+    specs = read_json(Specs, folder / "specs.json", "an experiment of DeepSDF's")
     codes = read_codes(folder / "LatentCodes" / f"{epoch}.pth", specs.CodeLength)
-    file, node = folder / "ModelParameters" / f"{epoch}.pth", decoder_node(specs)
+    file = folder / "ModelParameters" / f"{epoch}.pth"
+    node = config["decoder"] | decoder_settings(specs)
     weights = decoder_weights(_read(file, "model_state_dict"), node, file)
     saved_decoder(node, weights, file)  # or says what does not fit
-    names = shape_names(folder, specs, split, len(codes))
+    names = shape_names(folder, specs, config["split"], len(codes))
     source = config["data"]["source"]
     ids = [shape_id(name, by_synset(source["categories"])) for name in names]
     samples = Path(source["root"])
@@ -98,22 +90,17 @@ def import_deepsdf(composed: DictConfig) -> None:
     log.info("run: %s: %d shapes, %d of them with their source's frame", run, len(load(run).ids), len(known))
 
 
-def decoder_node(specs: Specs) -> dict[str, Any]:
-    """DeepSDF's decoder as a node of our config."""
+def decoder_settings(specs: Specs) -> dict[str, Any]:
+    """The settings of an experiment's decoder in our config; others are those of decoder=deepsdf."""
     network, depth = specs.NetworkSpecs, len(specs.NetworkSpecs.dims)
     return {
-        "_target_": "sdfhub.model.decoder.Decoder",
-        "encoding": {"_target_": "sdfhub.model.encodings.Identity"},
-        "activation": {"_target_": "sdfhub.model.activations.Relu", "_partial_": True},
         "code_size": specs.CodeLength,
         "depth": depth,
         "width": network.dims[0],
         "inject_encoding": list(range(1, depth + 1)) if network.xyz_in_all else network.latent_in,
         "inject_code": network.latent_in,
-        "shorten": True,
         "weight_norm": False,
         "dropout": network.dropout_prob if {*range(depth)} <= {*(network.dropout or [])} else 0.0,
-        "tanh": True,
     }
 
 
@@ -164,15 +151,11 @@ def shape_names(folder: Path, specs: Specs, split: str | None, count: int) -> li
     """Names of the shapes in the order of their codes, from `split` or the experiment's file, or numbers."""
     above = [Path(), folder.resolve(), *folder.resolve().parents]  # what TrainSplit may be relative to
     places = [at / specs.TrainSplit for at in above if specs.TrainSplit]
-    file = Path(split) if split else next((place for place in places if place.is_file()), None)
+    file = Path(str(split)) if split else next((place for place in places if place.is_file()), None)
     if file is None:
-        log.warning(
-            "%s: TrainSplit %s is not here: shapes are numbered; or give split=", folder, specs.TrainSplit
-        )
+        log.warning("%s: %s is not here: shapes are numbered; or give split=", folder, specs.TrainSplit)
         return [f"shape/{row:05d}" for row in range(count)]
     names = list(names_listed(str(file), "train"))
     if len(names) != count:
-        raise SdfhubError(
-            f"{file}: lists {len(names)} shapes, but there are codes of {count}; give another split="
-        )
+        raise SdfhubError(f"{file}: lists {len(names)} shapes, but there are codes of {count}; give split=")
     return names

@@ -31,6 +31,8 @@ from sdfhub.whole_file import refuse_unwritable
 
 log = logging.getLogger(__name__)
 
+PARTS = ("fit", "evidence", "calibration")  # beside `poses`, what decides when a fit is doubtful
+
 
 def scan_files(wanted: str | Sequence[str]) -> dict[str, Path]:
     """The files to read, those of a folder included, by the names of their results."""
@@ -51,15 +53,10 @@ def parts(config: DictConfig, space: Space) -> tuple[Reconstructor, Calibration]
     """What the config names, made: how scans are fitted in a space, and how limits are found."""
     frame = scan_frame(space, config["frame"], check(config["of"], str | int | None, "of"))
     poses = instantiate(config.poses, "poses", up=space.up)
-    reconstructor = Reconstructor(
-        space,
-        fit=instantiate(config.fit, "fit"),
-        evidence=instantiate(config.evidence, "evidence"),
-        frame=frame,
-        poses=poses if frame == "unknown" else None,
-        resolution=check(config["resolution"], Annotated[int, Field(ge=2)], "resolution"),
-    )
-    return reconstructor, instantiate(config.calibration, "calibration")
+    fit, evidence, calibration = (instantiate(config[name], name) for name in PARTS)
+    resolution = check(config["resolution"], Annotated[int, Field(ge=2)], "resolution")
+    poses = poses if frame == "unknown" else None
+    return Reconstructor(space, fit, evidence, frame, poses, resolution), calibration
 
 
 def scan_frame(space: Space, frame: Any, of: str | int | None) -> ScanFrame:
@@ -97,7 +94,7 @@ def limits_of(
     """The limits for kinds of scans; none, and a line that says why, where they cannot be had."""
     if not calibration.shapes:
         return {}
-    settings: dict[str, Any] = {key: plain(config[key]) for key in ("fit", "evidence", "calibration")}
+    settings: dict[str, Any] = {key: plain(config[key]) for key in PARTS}
     settings["poses"] = plain(config.poses) if scans.poses else None
     try:
         return calibration.limits(run, settings, kinds, scans, partial(unseen_shapes, run, config))
@@ -119,8 +116,7 @@ def reconstruct_run(config: DictConfig) -> list[Result]:
             raise SdfhubError(f"out={out}: the result of {path} would overwrite {mesh}")
     reconstructor, calibration = parts(config, load(run, trust=config.trust or ()))
     refuse_unwritable(out)
-    scans: dict[str, ObservedScan] = {}
-    results: list[Result] = []
+    scans, results = dict[str, ObservedScan](), list[Result]()
     for name, path in tqdm(files.items(), desc="reading", unit="scan", leave=False, disable=None):
         try:
             scans[name] = reconstructor.read(path, sensor)

@@ -19,7 +19,7 @@ from sdfhub.described import check
 from sdfhub.errors import SdfhubError
 from sdfhub.geometry.picture_file import contact_sheet
 from sdfhub.opening import data_of
-from sdfhub.report.pictures import FindTruth, Sheet, contact_sheet_of, loss_chart, picture_uri
+from sdfhub.report.pictures import FindTruth, contact_sheet_of, loss_chart, picture_uri
 from sdfhub.report.results import Cell, read_plan, read_sweep
 from sdfhub.report.rows import JUDGING_GROUPS, Group, group_cells, shapes_csv, table_csv
 from sdfhub.report.tables import Table, latex, markdown, origin, overview, tables
@@ -34,7 +34,11 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
     parts: list[dict[str, Any]] = []
     for group in groups:
         sheet = contact_sheet_of(group, shapes, find_truth)
-        write_sheet(sheet, out / f"{sheet_name(group)}.png")
+        if sheet.shapes:  # else nothing was judged
+            pictures = [[t.text if t.image is None else t.image for t in tiles] for _, tiles in sheet.rows]
+            captions = [column.replace(" (", "\n(") for column in sheet.columns]
+            labels = [label for label, _ in sheet.rows]
+            contact_sheet(pictures, labels, captions, out / f"{sheet_name(group)}.png")
         part = {"title": ", ".join(group.title), "tables": tables(group), "sheet": sheet}
         parts.append(part | {"chart": loss_chart(group)})
     sections: list[tuple[str, list[Table]]] = [("All tables", before)] if before else []
@@ -51,13 +55,11 @@ def write_report(sweep: Path, out: Path, shapes: int = 6) -> None:
 
 def page(**content: Any) -> str:
     """The page: text is escaped, and its policy lets no request out."""
-    folder = files("sdfhub.report")
-    style, script = ((folder / name).read_text("utf-8") for name in ("page.css", "viewer.js"))
+    script = (files("sdfhub.report") / "viewer.js").read_text("utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     loader = PackageLoader("sdfhub.report", ".")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-    environment.filters["data_uri"] = picture_uri
-    content |= {"style": Markup(style), "script": Markup(script), "script_hash": Markup(f"sha256-{digest}")}
+    content |= {"script": Markup(script), "script_hash": Markup(f"sha256-{digest}"), "uri": picture_uri}
     return environment.get_template("page.html.j2").render(content)
 
 
@@ -67,14 +69,6 @@ def sheet_name(group: Group) -> str:
     if group.settings:
         words.append(hashlib.sha256(";".join(sorted(group.settings)).encode()).hexdigest()[:8])
     return re.sub(r"[^A-Za-z0-9._-]", "-", "_".join(words))
-
-
-def write_sheet(sheet: Sheet, path: Path) -> None:
-    """A contact sheet as a picture of its own; none where nothing was judged."""
-    if sheet.shapes:
-        rows = [[t.text if t.image is None else t.image for t in tiles] for _, tiles in sheet.rows]
-        captions = [column.replace(" (", "\n(") for column in sheet.columns]
-        contact_sheet(rows, [label for label, _ in sheet.rows], captions, path)
 
 
 def truth_finder() -> FindTruth:

@@ -2,11 +2,10 @@
 
 import logging
 import warnings
-from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import hydra
 import torch
@@ -38,12 +37,11 @@ from sdfhub.settings import WHERE_NOT_WHAT, flat
 
 log = logging.getLogger(__name__)
 
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-
 # half precision needs a loss scale; pieces of a batch are differentiated without one
 WRONG_PRECISIONS = ("16", "16-true", "16-mixed", "transformer-engine", "transformer-engine-float16")
 WHOLE_MODEL = ("auto", "ddp")  # strategies that leave every weight on every device, as meshing needs
 
+# Lightning's warnings that a user can do nothing about
 NO_CONCERN = (
     ".*does not have many workers.*",
     ".*number of training batches.*smaller than the logging interval.*",
@@ -52,18 +50,11 @@ NO_CONCERN = (
     ".*ended before the epoch ended.*",  # the loader starts from the step that a checkpoint ends with
     ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
 )
-"""Lightning's warnings that a user can do nothing about."""
-
-OF_NO_CONCERN = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
-"""Lightning's loggers of what hardware there is not, advertisements, defaults of its own files."""
-
-
+# settings that change neither the model nor its data: a run may go on with others
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
-"""Settings that change neither the model nor its data: a run may go on with others."""
 
 
-@dataclass(frozen=True)
-class Parts:
+class Parts(NamedTuple):
     """What a config describes, made once, before the first shape is prepared."""
 
     data: SdfDataModule
@@ -81,8 +72,7 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     if config.ckpt_path:
         read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
-    data.prepare_data()
-    data.setup("fit")
+    data.setup("fit")  # prepares shapes that are missing
     ids, held_out = ([shape.id for shape in role] for role in (data.train_shapes, data.held_out_shapes))
     if config.ckpt_path:
         refuse_other_shapes(Path(config.ckpt_path), ids)
@@ -99,7 +89,11 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
         return {}
     if not (folder / "checkpoints" / LAST).exists():  # callbacks without one of checkpoints
         trainer.save_checkpoint(folder / "checkpoints" / LAST)
-    metrics = judge(model, parts, folder)
+    training = parts.record.summary(model) | {"made_with": made_with(trainer)}
+    model.to(trainer.strategy.root_device)  # Lightning has put it back on the CPU
+    trained = model.decoder, model.codes.table.detach(), model.loss.delta
+    shapes = dict(enumerate(data.train_shapes)), data.held_out_shapes
+    metrics = evaluate_model(*trained, *shapes, parts.evaluation, folder, training)
     log_scores(trainer, written, metrics)
     return metrics
 
@@ -108,11 +102,10 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
     """The objects of a training; refuses a setting that is unknown, missing, of the wrong type or range."""
     for message in NO_CONCERN:  # here, not at the start of the program: a launcher's workers come here too
         warnings.filterwarnings("ignore", message)
-    torch.manual_seed(check(config.seed, Seed, "seed"))
-    model = {name: instantiate(config[name], name) for name in ("decoder", "codes", "loss", "computing")}
+    torch.manual_seed(check(config.seed, Annotated[int, Field(ge=0, lt=2**31)], "seed"))
+    names = ["decoder", "codes", "loss", "computing", *(["validation"] if config.get("validation") else [])]
+    model = {name: instantiate(config[name], name) for name in names}
     model["optim"] = make_optimisation(config.optim)
-    validation = config.get("validation")
-    model["validation"] = instantiate(validation, "validation") if validation else None
     record = TrainingRecord()
     callbacks = [*named_parts(config.get("callbacks"), "callbacks", Callback), record]
     loggers = named_parts(config.get("logger"), "logger", Logger)
@@ -123,13 +116,11 @@ def make_parts(config: DictConfig, folder: Path) -> Parts:
 
 def named_parts(config: DictConfig | None, group: str, kind: type) -> list[Any]:
     """The objects of a group of named parts, all of a Lightning `kind`; a part that is null is left out."""
-    parts = []
-    for name, node in (config or {}).items():
-        if node is not None:
-            parts.append(instantiate(node, f"{group}.{name!s}"))
-            if not isinstance(parts[-1], kind):
-                raise SdfhubError(f"{group}.{name!s}: is no Lightning {kind.__name__}; give it a _target_")
-    return parts
+    nodes = {f"{group}.{name!s}": node for name, node in (config or {}).items() if node is not None}
+    parts = {key: instantiate(node, key) for key, node in nodes.items()}
+    if wrong := [key for key, part in parts.items() if not isinstance(part, kind)]:
+        raise SdfhubError(f"{wrong[0]}: is no Lightning {kind.__name__}; give it a _target_")
+    return list(parts.values())
 
 
 def make_optimisation(config: DictConfig) -> Optimisation:
@@ -145,19 +136,12 @@ def make_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], lo
     if str(config.get("precision")) in WRONG_PRECISIONS:
         raise SdfhubError(f"trainer.precision={config.precision}: needs a loss scale; use bf16-mixed")
     if not str(config.get("strategy", "auto")).startswith(WHOLE_MODEL):
-        raise SdfhubError(
-            f"trainer.strategy={config.strategy}: meshing needs a whole model a device; use ddp"
-        )
+        raise SdfhubError(f"trainer.strategy={config.strategy}: meshing needs a whole model; use ddp")
     has_logger = bool(loggers if config.get("logger") is None else config.logger)
     callbacks = fitting_callbacks(callbacks, has_logger, config.get("enable_progress_bar", True))
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
     ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
     ours["plugins"] = [WholeFileIO()]
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
-        logging.getLogger(name).handlers.clear()
-        logging.getLogger(name).propagate = True
-    for name in OF_NO_CONCERN:
-        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     return instantiate(config, "trainer", **given)
 
@@ -175,9 +159,7 @@ def fit(model: AutoDecoder, parts: Parts, checkpoint: str | None) -> None:
         is_loss = isinstance(error, torch.distributed.DistError) or "onnection" in str(error)
         if parts.trainer.world_size == 1 or not is_loss:
             raise
-        raise SdfhubError(
-            "another process of this run has died; continue from its last checkpoint"
-        ) from error
+        raise SdfhubError("another process of this run has died; continue its last checkpoint") from error
 
 
 def refuse_processes_in_multirun(trainer: Trainer) -> None:
@@ -208,15 +190,6 @@ def refuse_other_shapes(checkpoint: Path, ids: list[str]) -> None:
         if before != now:
             what = f"code {row} is that of {before}, now it would be that of {now}"
             raise SdfhubError(f"ckpt_path={checkpoint}: the shapes that data= offers have changed: {what}")
-
-
-def judge(model: AutoDecoder, parts: Parts, folder: Path) -> dict[str, Any]:
-    """What `metrics.json` holds: the training's cost and the scores of training and held-out shapes."""
-    training = parts.record.summary(model) | {"made_with": made_with(parts.trainer)}
-    model.to(parts.trainer.strategy.root_device)  # Lightning has put it back on the CPU
-    train, held_out = dict(enumerate(parts.data.train_shapes)), parts.data.held_out_shapes
-    codes, delta = model.codes.table.detach(), model.loss.delta
-    return evaluate_model(model.decoder, codes, delta, train, held_out, parts.evaluation, folder, training)
 
 
 def log_scores(trainer: Trainer, config: dict[str, Any], metrics: dict[str, Any]) -> None:

@@ -27,8 +27,7 @@ class Meshed(NamedTuple):
 class LiveMesher:
     """A thread that meshes the latest code on grids of rising `resolutions`: `show` gets each, or an error.
 
-    The first resolution is always finished, so that something moves while codes come faster than meshes; a
-    finer one is given up as soon as another code is asked for.
+    The first resolution is always finished, so that something moves; a finer one is given up for a new code.
     """
 
     def __init__(self, decoder: Decoder, resolutions: Sequence[int], show: Callable[[Any], None]):

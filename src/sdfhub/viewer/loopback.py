@@ -13,6 +13,7 @@ import socket
 from collections.abc import Collection
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import viser
@@ -23,16 +24,14 @@ from sdfhub.errors import SdfhubError
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # what a browser may call this machine
-MAX_UPLOAD = 64 << 20
-"""Bytes of an uploaded file. A larger one, or one of another type, arrives as an empty one."""
-
+MAX_UPLOAD = 64 << 20  # bytes of a file; a larger one, or one of another type, arrives as an empty one
 PART = 512 << 10  # bytes of the parts in which viser's page sends a file
+# what the page may load: itself, and from nowhere but here
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
     "style-src 'unsafe-inline'; img-src blob: data:; font-src data:; connect-src ws://{host} blob: data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""What the page may load: itself, and from nowhere but here."""
 
 _QUIET = logging.getLogger(__name__)
 _QUIET.setLevel(logging.CRITICAL)  # whoever knocks and is refused is no news, and none for a traceback
@@ -46,12 +45,8 @@ class LoopbackServer(viser.ViserServer):
             socket.create_server((HOST, port)).close()
         except OSError as error:
             raise SdfhubError(f"port={port}: is taken or not allowed; 0 takes a free one") from error
-        plain = sockets.serve
-        sockets.serve = partial(_Serve, suffixes)  # type: ignore[misc, assignment]  # viser has no option for it
-        try:
+        with patch.object(sockets, "serve", partial(_Serve, suffixes)):  # viser has no option for it
             super().__init__(host=HOST, port=port, label=label, verbose=False)
-        finally:
-            sockets.serve = plain  # type: ignore[misc]
 
 
 def refusal(request: Request) -> tuple[http.HTTPStatus, str] | None:

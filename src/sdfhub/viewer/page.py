@@ -14,26 +14,21 @@ from sdfhub.errors import SdfhubError
 from sdfhub.geometry.surface import sample_surface
 from sdfhub.scans import scan as scans
 from sdfhub.scans.observed_scan import observe
-from sdfhub.scans.scan import read_scan
 from sdfhub.shapes import turned_up
 from sdfhub.space import Space
 from sdfhub.viewer.live_meshing import LiveMesher, Meshed
 from sdfhub.viewer.loopback import MAX_UPLOAD, LoopbackServer
 
+# meshes and clouds of a whole shape; archives also carry views and samples, whose frame has to be said
 FORMATS = tuple(suffix for suffix in scans.FORMATS if suffix != ".npz")
-"""Meshes and clouds of a whole shape. Archives also carry views and samples, whose frame has to be said."""
-
 POINTS = 4000  # points of a scan's surface that are shown
 DIRECTIONS, REACH = 6, 3.0  # sliders along principal directions, and how far they go, in standard deviations
-RUNGS = (64, 128)
-"""Points along an axis of the grid while something moves, and on the way to what was asked for at rest."""
-
+RUNGS = (64, 128)  # points along an axis of the grid while something moves, and on the way to rest
 FAR = 0.03  # mean distance of a scan's surface to the fitted one, in a size of 2, that no good fit leaves
 STRANGE = 2.0  # times as unusual as the most unusual of the space's own codes: no shape of its kind
 MEAN = "(mean of all shapes)"
+# where the camera stands and looks, z up: a little past the shape, which the controls would cover
 EYE_AND_AIM = np.array([[1.75, -2.75, 1.3], [0.25, 0.15, -0.05]])
-"""Where the camera stands and looks, z up: a little past the shape, which the controls would cover."""
-
 CLAY, SCAN = (201, 131, 92), (42, 92, 170)
 STYLE = (Path(__file__).parent / "viewer.css").read_text(encoding="utf-8")
 
@@ -42,8 +37,7 @@ class Viewer:
     """The page of a space, its grid of `resolution` points along an axis when nothing moves."""
 
     def __init__(self, space: Space, title: str, port: int, resolution: int):
-        self.space = space
-        self.scans: dict[str, np.ndarray] = {}
+        self.space, self.scans = space, dict[str, np.ndarray]()
         # codes [L] by the names under which the page offers them
         self.shapes = {id: space.code(id) for id in space.ids} | {MEAN: space.distribution.mean}
         self.axes = space.principal_directions[:DIRECTIONS]
@@ -76,11 +70,10 @@ class Viewer:
         """Back to the shape A itself."""
         for slider in (self.share, *self.sliders):
             slider.value = 0.0
-        points = self.scans.get(self.a.value)
+        name = self.a.value
         with self.server.atomic():
-            self.scan.visible = points is not None
-            if points is not None:
-                self.scan.points = points
+            self.scan.visible = name in self.scans
+            self.scan.points = self.scans.get(name, self.scan.points)
         self.refresh()
 
     def fit(self, name: str, content: bytes) -> None:
@@ -106,9 +99,7 @@ class Viewer:
         with torch.no_grad():
             distance = float(self.space.sdf(surface, code).abs().mean())
         is_strange = self.space.unusual(code) > STRANGE * self.space.unusual(self.space.codes).max()
-        doubt = (
-            " Doubtful: far, or a code unlike those of this space." if distance > FAR or is_strange else ""
-        )
+        doubt = " Doubtful: far, or a code unlike the known ones." if distance > FAR or is_strange else ""
         return f"the scan's surface is {distance:.4f} off the fitted one, on average of a size of 2.{doubt}"
 
     def _draw(self, meshed: Meshed | SdfhubError) -> None:
@@ -166,24 +157,20 @@ class Viewer:
 
 def fit_scan(space: Space, name: str, content: bytes) -> tuple[Tensor, np.ndarray]:
     """The code [L] of the shape in a file, and points [M, 3] of the scan's surface, normalised frame."""
-    suffix = PurePath(name).suffix.lower()
-    if suffix not in FORMATS:
-        raise SdfhubError(f"{name}: not a format known here ({' '.join(FORMATS)})")
     rng = np.random.default_rng(0)
     with TemporaryDirectory() as folder:  # a .gltf can name files of its folder: there are none
-        path = Path(folder) / f"scan{suffix}"
+        path = Path(folder) / f"scan{PurePath(name).suffix}"
         path.write_bytes(content)
         try:
-            scan = read_scan(path)
+            scan = scans.read_scan(path)
             observed = observe(scan, space.evidence, "shape", rng)
             code = space.fit_observations([observed.observation]).codes[0]
         except (SdfhubError, ValueError) as error:
             reason = str(error).replace(str(path), name)
             raise SdfhubError(reason if name in reason else f"{name}: {reason}") from error
-    if scan.faces is None:
-        surface = scan.points[rng.permutation(len(scan.points))[:POINTS]]
-    else:
-        surface = sample_surface(scan.points, scan.faces, POINTS, rng)[0]
+    points, faces = scan.points, scan.faces
+    rows = rng.permutation(len(points))[:POINTS]
+    surface = points[rows] if faces is None else sample_surface(points, faces, POINTS, rng)[0]
     return code, observed.frame.to_normalized(surface).astype(np.float32)
 
 
