@@ -115,7 +115,7 @@ def judge_all(decoder: Decoder, roles: Sequence[Role], evaluation: Evaluation, o
 
     workers = (os.cpu_count() or 1) if evaluation.workers is None else evaluation.workers
     workers = min(workers, len(roles) // WORTH_A_PROCESS)
-    judge_one = lambda pair: judge(*pair, evaluation.points, evaluation.seed)  # noqa: E731
+    judge_one = lambda pair: judge(pair[0], pair[1], evaluation.points, evaluation.seed)  # noqa: E731
     metrics = [row for _, row in sorted(map_in_processes(judge_one, pairs(), workers))]
     if any(isinstance(row, Crashed) for row in metrics):
         raise SdfhubError("a process that judges died twice: out of memory? try evaluate.workers=0")
