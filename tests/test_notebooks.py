@@ -45,7 +45,9 @@ def run_notebook(path: Path, folder: Path, kernel, monkeypatch) -> None:
         for setting, less in {"trainer.max_epochs=8": 2, "data.shapes=12": 6}.items():
             cell.source = cell.source.replace(setting, f"{setting.partition('=')[0]}={less}")
     notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n%cd {folder}"))
-    nbclient.NotebookClient(notebook, kernel, timeout=280).execute()
+    client = nbclient.NotebookClient(notebook, kernel, timeout=280)
+    client.execute()
+    client.kc.stop_channels()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs), "it shows something"
     assert not [output for output in outputs if output.get("name") == "stderr"], "and warns of nothing"

@@ -44,8 +44,8 @@ class Stored:
     def rows(self, name: str) -> int:
         return 64
 
-    def read(self, name: str, start: int, count: int) -> np.ndarray:
-        return np.full((count, 6 if name == "surface" else 4), 0.25, np.float32)
+    def read(self, name: str, start: int = 0, count: int | None = None) -> np.ndarray:
+        return np.full((count or 64, 6 if name == "surface" else 4), 0.25, np.float32)
 
 
 def model_of(experiment: str, *overrides: str) -> AutoDecoder:

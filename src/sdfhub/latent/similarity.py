@@ -55,9 +55,11 @@ class PoseRange:
 
     def spread(self) -> Tensor:
         """[7] standard deviations of a small similarity: half the range, or half a step between turns."""
-        turn = torch.full((3,), math.radians(self.tilt) / 2)
-        turn[AXES[self.up]] = math.pi / self.turns
-        return torch.tensor([math.log(self.scale) / 2, *turn.tolist(), *[self.shift / 2] * 3])
+        spread = torch.full((SIZE,), self.shift / 2)
+        spread[0] = math.log(self.scale) / 2
+        spread[1:4] = math.radians(self.tilt) / 2
+        spread[1 + AXES[self.up]] = math.pi / self.turns
+        return spread
 
     def holds(self, poses: Similarity) -> Tensor:
         """[B] whether similarities lie within the range."""

@@ -50,6 +50,8 @@ NO_CONCERN = (
     ".*ended before the epoch ended.*",  # the loader starts from the step that a checkpoint ends with
     ".*LeafSpec.*",  # Lightning's own use of a name that torch retires
 )
+# Lightning's loggers of what hardware there is not, advertisements, defaults of its own files
+QUIET = ("pytorch.utilities.rank_zero", "fabric.utilities.rank_zero", "pytorch.trainer.connectors")
 # settings that change neither the model nor its data: a run may go on with others
 FREE_TO_CHANGE = (*WHERE_NOT_WHAT, "evaluate.", "data.source.root", "data.source.up", "trainer.max_")
 
@@ -142,6 +144,11 @@ def make_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], lo
     ours: dict[str, Any] = {"default_root_dir": folder, "logger": loggers or False, "callbacks": callbacks}
     ours["enable_checkpointing"] = any(isinstance(callback, Checkpoint) for callback in callbacks)
     ours["plugins"] = [WholeFileIO()]
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):  # their text goes into train.log
+        logging.getLogger(name).handlers.clear()
+        logging.getLogger(name).propagate = True
+    for name in QUIET:
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     given = {name: value for name, value in ours.items() if config.get(name) is None}
     return instantiate(config, "trainer", **given)
 

@@ -119,7 +119,8 @@ class SdfDataModule(L.LightningDataModule):
         if self.train_shapes:
             return
         if self.loader.surface_per_shape and not self.source.has_normals:
-            raise SdfhubError(f"normals=on: the files of data={self.source.name} carry none; use normals=off")
+            what = f"the files of data={self.source.name} carry none; train with normals=off"
+            raise SdfhubError(f"normals=on: {what}")
         self.train_shapes, self.held_out_shapes = self.prepared(self.split)
 
     @cached_property
