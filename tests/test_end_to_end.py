@@ -1,7 +1,6 @@
 """The product as a user runs it: the script in processes of its own, meshes in, a Chamfer table out."""
 
 import csv
-import itertools
 import json
 import os
 import re
@@ -292,9 +291,12 @@ def test_two_processes_train_like_one_with_the_same_batch(tmp_path, monkeypatch)
         assert torch.allclose(value, states[1][name], atol=1e-4), name
 
 
-COMBINATIONS = list(
-    itertools.product(["relu", "siren", "hosc"], ["none", "fourier", "gaussian", "hash"], ["on", "off"])
-)
+COMBINATIONS = """
+relu  none on, relu  fourier off, relu  gaussian on,  relu  hash off,
+siren none on, siren fourier on,  siren gaussian off, siren hash on,
+hosc  none off, hosc fourier on,  hosc  gaussian on,  hosc  hash off
+"""
+"""Every pair of choices of activation, encoding and normals."""
 
 
 @pytest.fixture(scope="module")
@@ -319,9 +321,10 @@ def fit(module: L.LightningModule, batches, steps: int, callback: L.Callback, **
     trainer.fit(module, torch.utils.data.DataLoader(batches, sampler=range(steps), batch_size=None))
 
 
-@pytest.mark.parametrize(("activation", "encoding", "normals"), COMBINATIONS)
-def test_every_combination_lowers_its_loss_from_its_defaults(activation, encoding, normals, ball_batches):
-    choices = [f"activation={activation}", f"encoding={encoding}", f"normals={normals}"]
+@pytest.mark.parametrize("words", COMBINATIONS.split(","), ids=lambda words: "-".join(words.split()))
+def test_combinations_lower_their_loss_from_their_defaults(words, ball_batches):
+    names = ("activation", "encoding", "normals")
+    choices = [f"{name}={word}" for name, word in zip(names, words.split(), strict=True)]
     module = build_autodecoder(composed(*choices), rows=4)
     losses = []
 
