@@ -2,7 +2,7 @@
 
     python benchmarks/accuracy.py [--seeds 3] [overrides for every run]
 
-Trains experiment=fft_hosc at scale=demo (8 chairs, 1600 steps) with equal seeds, data and steps: by
+Trains experiment=fft_hosc at scale=tiny (8 chairs, 1600 steps) with equal seeds, data and steps: by
 plain_training.py, by train.py in float32 and with trainer.precision=bf16-mixed; all are judged in float32.
 Prints the training shapes' CD times 10^3 and its excess over the floor, and what the mean CD is to that of
 the plain training; seeds differ in weights and order of samples, so their spread is the noise that a ratio
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("overrides", nargs="*")
     args = parser.parse_args()
-    common = ["scale=demo", "experiment=fft_hosc", "callbacks=none", "data.held_out=0", *args.overrides]
+    common = ["scale=tiny", "experiment=fft_hosc", "callbacks=none", "data.held_out=0", *args.overrides]
     scores = "CD, mean | CD, median | excess, mean | excess, median"
     head(f"seed | training | {scores} | mean CD to the plain one's")
     found: dict[str, list[list[float]]] = {way: [] for way in WAYS}

@@ -1,6 +1,6 @@
 """`train.py` with every step as a textbook writes it: what sdfhub's fast path must be as good as.
 
-    python benchmarks/plain_training.py activation=hosc encoding=fourier scale=demo
+    python benchmarks/plain_training.py activation=hosc encoding=fourier scale=tiny
 
 The code is copied to every point, activations are PyTorch's own functions, gradients in space come from a
 double backward, and the whole batch is one piece on PyTorch's own threads. Data, optimiser, schedule and

@@ -1,7 +1,7 @@
 """What searches for settings found: the best trials of each beside the defaults, trained alike.
 
-    python train.py -m hparams_search=fft_hosc scale=demo                  # a search, for each row
-    python train.py experiment=fft_hosc scale=demo hydra.run.dir=SWEEP_DIR/defaults
+    python train.py -m hparams_search=fft_hosc scale=tiny                  # a search, for each row
+    python train.py experiment=fft_hosc scale=tiny hydra.run.dir=SWEEP_DIR/defaults
     python benchmarks/searches.py SWEEP_DIR ... [--best 3] [--csv trials.csv]
     python benchmarks/searches.py trials.csv --only demo_fft_hosc --best 2 --enqueue OTHER_DIR
     python train.py -m hparams_search=fft_hosc scale=cpu hparams_search.trials=2 \\

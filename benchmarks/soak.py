@@ -30,7 +30,7 @@ CALIBRATION = 40
 
 def command(folder: Path, name: str, epochs: int) -> list[str]:
     """A small training on the CPU: steps of some milliseconds, a checkpoint every second or so."""
-    words = ["scale=demo", "data.held_out=0", "callbacks=quiet", "trainer=cpu", "evaluate=fast"]
+    words = ["scale=tiny", "data.held_out=0", "callbacks=quiet", "trainer=cpu", "evaluate=fast"]
     words += ["evaluate.train=2", "data.preparation.samples=20000", "trainer.enable_progress_bar=false"]
     words += [f"trainer.max_epochs={epochs}", f"data.store={folder / 'store'}"]
     return [sys.executable, "train.py", *words, f"hydra.run.dir={folder / name}"]

@@ -28,7 +28,7 @@ from tests.tiny import STORE, build_autodecoder, composed, read_weights, run_com
 
 OPEN = ROOT / "data" / "open"
 TINY = [
-    "scale=demo",
+    "scale=tiny",
     "data.preparation.samples=4000",
     "data.preparation.surface_points=2000",
     "data.loader.samples_per_shape=256",

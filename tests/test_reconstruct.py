@@ -28,7 +28,7 @@ from tests.test_fitting import ball
 from tests.test_training import batches
 from tests.tiny import build_autodecoder, composed, run_command
 
-SPACE = ["scale=demo", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
+SPACE = ["scale=tiny", "decoder.width=32", "decoder.code_size=4", "activation=siren"]
 SPACE += ["encoding=none", "data.preparation.samples=4000", "data.preparation.surface_points=2000"]
 QUICK = ["evidence.rows=1200", "evidence.samples=1200", "evidence.cells=24", "fit.thinning=2"]
 QUICK += ["fit.probes=64", "resolution=24"]

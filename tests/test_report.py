@@ -113,7 +113,7 @@ def test_a_shape_without_a_surface_counts_with_its_penalty_and_is_counted(tmp_pa
 
 def test_rows_print_the_settings_in_which_they_differ_and_whether_they_were_searched(tmp_path):
     config = {"activation": {"omega": 5}, "decoder": {"activation": {"omega": 5}}, "paths": {"output": "x"}}
-    write_cell(tmp_path, planned("SIREN"), [0.1e-3], config=config | {"searched": "16 trials | scale=demo"})
+    write_cell(tmp_path, planned("SIREN"), [0.1e-3], config=config | {"searched": "16 trials | scale=tiny"})
     config = {"activation": {"omega": 7}, "decoder": {"activation": {"omega": 7}}, "loss": {"delta": 0.1}}
     write_cell(tmp_path, planned("FFT/SIREN"), [0.1e-3], config=config | {"paths": {"output": "y"}})
     enter_cells(tmp_path, [planned("FFT/HOSC")])
@@ -122,7 +122,7 @@ def test_rows_print_the_settings_in_which_they_differ_and_whether_they_were_sear
         ["activation.omega, decoder.activation.omega", "5", "7"],
         ["loss.delta", "–", "0.1"],
     ]
-    assert found["Training shapes"]["searched"].tolist() == ["16 trials | scale=demo", "no", "–"]
+    assert found["Training shapes"]["searched"].tolist() == ["16 trials | scale=tiny", "no", "–"]
 
 
 def test_failed_missing_and_broken_cells_carry_their_reason(small):

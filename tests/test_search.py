@@ -28,10 +28,10 @@ def test_a_search_has_the_budget_of_all_and_settings_of_its_row(search):
 
 @pytest.fixture
 def search(monkeypatch, tmp_path):
-    """`python train.py -m hparams_search=fft_hosc scale=demo ...` without training."""
+    """`python train.py -m hparams_search=fft_hosc scale=tiny ...` without training."""
     training = stand_in(monkeypatch, tmp_path)
     plain_start = training.start
-    training.start = lambda *words: plain_start("-m", "hparams_search=fft_hosc", "scale=demo", *words)
+    training.start = lambda *words: plain_start("-m", "hparams_search=fft_hosc", "scale=tiny", *words)
     training.folders = lambda: sorted((tmp_path / "outputs" / "sweeps").iterdir())
     return training
 
@@ -75,7 +75,7 @@ def test_searches_under_other_settings_are_other_searches(search):
     for words in ((), ("seed=1",), ("data.workers=1",)):
         assert search.start("hparams_search.trials=1", *words) == 0
     assert [config["seed"] for config in search.configs] == [0, 1], "each has its own budget"
-    assert all(path.name.startswith("search_fft_hosc_procedural_chairs_demo_") for path in search.folders())
+    assert all(path.name.startswith("search_fft_hosc_procedural_chairs_tiny_") for path in search.folders())
 
 
 def test_the_objective_weighs_roles_alike_and_counts_shapes_without_a_surface():

@@ -165,7 +165,7 @@ def test_groups_that_no_name_tells_are_settings_where_they_are_said():
 
 def test_cells_of_a_nameless_multirun_lie_in_one_folder_of_their_own(training, tmp_path):
     for _ in range(2):
-        assert training.start("-m", "activation=relu,siren", "scale=demo") == 0
+        assert training.start("-m", "activation=relu,siren", "scale=tiny") == 0
     assert len(training.configs) == 4
     both = list((tmp_path / "outputs" / "sweeps").iterdir())
     assert len(both) == 2 and all(len(read_sweep(sweep)) == 2 for sweep in both)

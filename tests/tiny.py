@@ -20,7 +20,7 @@ from sdfhub.tasks.train import make_optimisation
 
 ROOT = Path(__file__).parents[1]
 TINY = [
-    "scale=demo",
+    "scale=tiny",
     "data.shapes=2",
     "data.held_out=1",
     "data.preparation.samples=4000",
