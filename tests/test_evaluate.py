@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from sdfhub.evaluation import judging
 from sdfhub.evaluation.judging import Evaluation, judge_all
-from sdfhub.evaluation.scoresheet import Judged, table, write_scores
+from sdfhub.evaluation.scoresheet import Judged, table, write_scores, write_sheet
 from sdfhub.geometry.metrics import DistanceMetrics, judge
 from sdfhub.latent.gauss_newton import GaussNewtonFit
 from sdfhub.shapes import Frame, Mesh
@@ -83,6 +84,18 @@ def test_shapes_without_meshes_have_scores_of_their_distances(tmp_path, caplog):
     assert result["train"]["summary"]["sdf_error"]["mean"] == pytest.approx(0.02)
     assert result["train"]["shapes"][1] == {"id": "1", "sdf_error": 0.03, "sign_accuracy": 1.0}
     assert "judged by signed distances" in caplog.text and "20.0000" in table(judged)
+
+
+def test_shapes_of_a_role_lie_in_a_band_of_the_sheet(tmp_path):
+    red, blue = (np.full((40, 40, 3), colour, np.uint8) for colour in ([200, 30, 30], [30, 30, 200]))
+    roles = ["train"] * 3 + ["held_out"]
+    metrics = judge(Mesh(*icosphere(0.5, 3)), truth(icosphere(0.55, 3)), 500)
+    shown = [Judged(role, shape, metrics, (red, blue)) for role, shape in zip(roles, shapes(4), strict=True)]
+    write_sheet(shown, tmp_path / "s.png")
+    page = np.asarray(Image.open(tmp_path / "s.png")).astype(int)
+    widths = [(page == colour).all(axis=-1).sum(axis=1) for colour in ([200, 30, 30], [30, 30, 200])]
+    bands = np.select([widths[0] > 0, widths[1] > 0], [widths[0], -widths[1]])
+    assert [*bands[np.flatnonzero(np.diff(bands, prepend=0))]] == [120, 0, -120, 0, 40, 0, -40, 0]
 
 
 @pytest.mark.parametrize("wrong", [{"resolution": 1}, {"points": 0}, {"fit_together": 0}, {"pictures": -1}])

@@ -54,13 +54,21 @@ def write_scores(
     log.info(table(judged))
     if any(isinstance(row.metrics, DistanceMetrics) for row in judged):
         log.info("\nthis source holds no meshes: judged by signed distances, not by surfaces")
-    if pictures := [row.pictures for row in judged if row.pictures]:
-        captions = [_caption(row) for row in judged if row.pictures]
-        labels = ["ground truth", "reconstruction"]
-        contact_sheet(list(zip(*pictures, strict=True)), labels, captions, out / "contact_sheet.png")
+    if drawn := [row for row in judged if row.pictures]:
+        write_sheet(drawn, out / "contact_sheet.png")
     write_whole(out / "metrics.json", json.dumps(result, indent=1, default=str))  # last: the run is finished
     log.info("\nscores, meshes and contact sheet: %s", out)
     return result
+
+
+def write_sheet(drawn: Sequence[Judged], path: Path) -> None:
+    """Draws shapes that have pictures, those of each role side by side: ground truth above reconstruction."""
+    roles = _by_role(drawn).values()
+    columns, rows, captions = max(map(len, roles)), [], []
+    for shapes in roles:
+        rows += zip(*[shape.pictures for shape in shapes], strict=True)
+        captions += [*map(_caption, shapes), *[""] * (2 * columns - len(shapes))]
+    contact_sheet(rows, ["ground truth", "reconstruction"] * len(roles), captions, path)
 
 
 def table(judged: Sequence[Judged]) -> str:

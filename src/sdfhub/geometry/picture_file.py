@@ -24,7 +24,7 @@ def contact_sheet(
     font, large = ImageFont.load_default(font_size), ImageFont.load_default(max(6, size // 9))
     left = int(max(map(font.getlength, row_labels), default=-14)) + 20
     tall = int(1.35 * font_size * max((caption.count("\n") + 1 for caption in captions), default=0)) + 16
-    bands = [tall if i * columns < len(captions) else _GAP for i in range(len(rows))]
+    bands = [tall if any(captions[i * columns :][:columns]) else _GAP for i in range(len(rows))]
     page = Image.new("RGB", (left + columns * (size + _GAP), sum(bands) + len(rows) * size + _GAP), "white")
     top = 0
     for i, (row, band) in enumerate(zip(rows, bands, strict=True)):
