@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import field
-from io import BufferedReader
+from io import FileIO
 from pathlib import Path
 from typing import Literal
 
@@ -146,13 +146,13 @@ class StoredShape:
         """Fills `rows` [n, C], contiguous, with those of an array from row `start` on, as `read` does."""
         if not len(rows):
             return
-        start %= self.rows(name)
+        count, first = self.rows(name), self._start + self._header[name]["data_offsets"][0]
+        start %= count
         with self._opened() as file:
             while len(rows):
-                part, rows = np.split(rows, [min(len(rows), self.rows(name) - start)])
-                file.seek(self._start + self._header[name]["data_offsets"][0] + start * part.strides[0])
-                file.readinto(part.data.cast("B"))
-                start = 0
+                part = rows[: count - start]
+                os.preadv(file.fileno(), [part], first + start * rows.strides[0])
+                rows, start = rows[len(part) :], 0
 
     def is_intact(self) -> bool:
         """Whether the file's content still has its sha256; reads all of it."""
@@ -163,9 +163,9 @@ class StoredShape:
         return False
 
     @contextmanager
-    def _opened(self) -> Iterator[BufferedReader]:
+    def _opened(self) -> Iterator[FileIO]:
         try:
-            with open(self.path, "rb", opener=_without_links) as file:
+            with open(self.path, "rb", 0, opener=_without_links) as file:
                 if (size := os.fstat(file.fileno()).st_size) != self._size:
                     raise ValueError(f"it has {size} bytes, not {self._size}")
                 yield file
