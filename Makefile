@@ -24,8 +24,8 @@ $(DEV_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: install ## train HOSC + Fourier + normals on procedural chairs and print the Chamfer table (minutes)
-	$(BIN)/python train.py experiment=fft_hosc scale=demo
+demo: install ## train SIREN + Fourier + normals on 300 procedural chairs, judge 8 of them and 8 unseen ones (minutes)
+	$(BIN)/python train.py experiment=fft_siren scale=demo
 
 test: $(DEV_STAMP) ## run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder

@@ -17,6 +17,13 @@ from sdfhub.data.preparation.sampling import normalize_mesh
 from sdfhub.geometry.surface import piece_count
 from sdfhub.procedural import generate
 
+
+def loading(shapes: int, samples: int, passes: int) -> list[str]:
+    """A step's shapes and samples of each, a quarter as many surface points, and passes an epoch."""
+    counts = {"shapes_per_step": shapes, "samples_per_shape": samples, "passes_per_epoch": passes}
+    return [f"scale.normal_points={samples // 4}", *(f"data.loader.{k}={n}" for k, n in counts.items())]
+
+
 NEAR = ["loss.far_weight=1", "data.preparation.near_share=0.94"]  # as in the paper
 FAR = ["loss.far_weight=5", "data.preparation.near_share=0.8"]
 DECOYS = ["data.preparation.decoy_share=0.1"]
@@ -47,11 +54,9 @@ WAYS = {
         "+callbacks.ema._target_=lightning.pytorch.callbacks.EMAWeightAveraging",
         "+callbacks.ema.decay=0.99",
     ],
-    "half the shapes, twice the samples": [
-        "data.loader.shapes_per_step=25",
-        "data.loader.samples_per_shape=256",
-        "data.loader.passes_per_epoch=5",
-    ],
+    "25 shapes of 128 samples": loading(25, 128, 10),
+    "50 shapes of 64 samples": loading(50, 64, 10),
+    "100 shapes of 32 samples": loading(100, 32, 20),
 }
 
 
