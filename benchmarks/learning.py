@@ -56,6 +56,7 @@ WAYS = {
     ],
     "25 shapes of 128 samples": loading(25, 128, 10),
     "50 shapes of 64 samples": loading(50, 64, 10),
+    "50 shapes of 128 samples": loading(50, 128, 10),
     "100 shapes of 32 samples": loading(100, 32, 20),
 }
 
