@@ -64,9 +64,9 @@ def write_scores(
 def write_sheet(drawn: Sequence[Judged], path: Path) -> None:
     """Draws shapes that have pictures, those of each role side by side: ground truth above reconstruction."""
     roles = _by_role(drawn).values()
-    columns, rows, captions = max(map(len, roles)), [], []
+    columns, rows, captions = max(map(len, roles)), list[Any](), list[str]()
     for shapes in roles:
-        rows += zip(*[shape.pictures for shape in shapes], strict=True)
+        rows += zip(*[shape.pictures for shape in shapes if shape.pictures], strict=True)
         captions += [*map(_caption, shapes), *[""] * (2 * columns - len(shapes))]
     contact_sheet(rows, ["ground truth", "reconstruction"] * len(roles), captions, path)
 

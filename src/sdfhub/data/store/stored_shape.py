@@ -151,7 +151,7 @@ class StoredShape:
         with self._opened() as file:
             while len(rows):
                 part = rows[: count - start]
-                os.preadv(file.fileno(), [part], first + start * rows.strides[0])
+                os.preadv(file.fileno(), [part.data], first + start * rows.strides[0])
                 rows, start = rows[len(part) :], 0
 
     def is_intact(self) -> bool:
