@@ -59,7 +59,7 @@ print("ran", flush=True)
 for name in ("random", "loky", "struct"):  # in the current folder, not to be imported
     open(name + ".py", "w").write("raise SystemExit('imported ' + __file__)")
 def slow(number):
-    print("started", os.getpid(), flush=True)
+    os.write(1, f"started {os.getpid()}\\n".encode())  # at once: two workers write
     time.sleep(number)
     return number
 print(sorted(result for _, result in map_in_processes(slow, [float(word) for word in sys.argv[1:]], 2)))
