@@ -74,7 +74,8 @@ def train_into(config: DictConfig, folder: Path) -> dict[str, Any]:
     if config.ckpt_path:
         read_checkpoint(Path(config.ckpt_path))  # a damaged one is refused before shapes are prepared
         refuse_other_settings(Path(config.ckpt_path), written)
-    data.setup("fit")  # prepares shapes that are missing
+    data.prepare_data()
+    data.setup("fit")
     ids, held_out = ([shape.id for shape in role] for role in (data.train_shapes, data.held_out_shapes))
     if config.ckpt_path:
         refuse_other_shapes(Path(config.ckpt_path), ids)
